@@ -1,0 +1,21 @@
+"""The errors a person can mend: each message names what failed, what was expected and what to do."""
+
+
+class UserError(Exception):
+    """Base of every error whose cause is input; entry points print it as one line, with no traceback."""
+
+
+class DataError(UserError, ValueError):
+    """A dataset file or folder is missing, damaged or not in the expected layout."""
+
+
+class ConfigError(UserError, ValueError):
+    """A configuration key or value is not one the program knows."""
+
+
+class CheckpointError(UserError, RuntimeError):
+    """A checkpoint cannot be read, written, or does not fit the configuration."""
+
+
+class TrainingDiverged(UserError, RuntimeError):
+    """Losses or gradients stayed non-finite for too many steps in a row."""

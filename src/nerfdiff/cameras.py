@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfdiff.precision import full_precision
+
 
 @dataclass(frozen=True)
 class Rays:
@@ -91,9 +93,10 @@ class Cameras:
         R, centre = source.c2w[..., :3, :3], source.c2w[..., :3, 3:]
         inverse = torch.zeros_like(source.c2w)
         inverse[..., :3, :3] = R.mT
-        inverse[..., :3, 3:] = -R.mT @ centre
+        inverse[..., :3, 3:] = -(R.mT * centre.mT).sum(-1, keepdim=True)
         inverse[..., 3, 3] = 1
-        c2w = inverse @ self.c2w
+        with full_precision(self.c2w.device):
+            c2w = inverse @ self.c2w
         return replace(self, c2w=c2w, K=self.K.expand(*c2w.shape[:-2], 3, 3))
 
     def resized(self, height: int, width: int) -> "Cameras":
@@ -121,7 +124,8 @@ class Cameras:
         fx, fy, cx, cy = (self.K[..., i, j, None, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
         x, y = (u - cx) / fx, (v - cy) / fy
         local = torch.stack([x, y, torch.ones_like(x)], dim=-1)
-        directions = torch.einsum("...ij,...hwj->...hwi", self.c2w[..., :3, :3], local)
+        with full_precision(self.c2w.device):
+            directions = torch.einsum("...ij,...hwj->...hwi", self.c2w[..., :3, :3], local)
         directions = directions / directions.norm(dim=-1, keepdim=True)
         origins = self.centres[..., None, None, :].expand_as(directions)
         bounds = [torch.as_tensor(b, dtype=self.K.dtype, device=self.K.device) for b in (near, far)]
@@ -132,6 +136,8 @@ class Cameras:
         self, points: Float[Tensor, "*batch n 3"]
     ) -> tuple[Float[Tensor, "*batch n 2"], Float[Tensor, "*batch n"]]:
         """World points to (u, v) pixels and depth z. Points with z <= 0 give meaningless pixels."""
-        local = torch.einsum("...ji,...nj->...ni", self.c2w[..., :3, :3], points - self.centres[..., None, :])
-        uvw = torch.einsum("...ij,...nj->...ni", self.K, local)
+        offsets = points - self.centres[..., None, :]
+        with full_precision(self.c2w.device):
+            local = torch.einsum("...ji,...nj->...ni", self.c2w[..., :3, :3], offsets)
+            uvw = torch.einsum("...ij,...nj->...ni", self.K, local)
         return uvw[..., :2] / uvw[..., 2:], local[..., 2]

@@ -4,10 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras
+from nerfdiff.errors import DataError
+
+
+class MissingSplit(DataError):
+    """The dataset is there, but not the split that was asked for."""
 
 
 @dataclass(frozen=True)
@@ -16,8 +21,8 @@ class Scene:
 
     Args:
         id: the scene's name within its dataset.
-        views: names (file stems) of the views, in the order of `images`.
-        images: colours in [0, 1], composited on white.
+        views: names (file stems) of the views, in the order of `pixels`.
+        pixels: 8-bit colours, composited on white (they become floats only where they are used).
         cameras: one camera per image, in the dataset's world.
         near, far: bounds of the scene as distances along rays, in scene units.
         mask: foreground, where the dataset knows it.
@@ -26,12 +31,17 @@ class Scene:
 
     id: str
     views: tuple[str, ...]
-    images: Float[Tensor, "views 3 height width"]
+    pixels: UInt8[Tensor, "views 3 height width"]
     cameras: Cameras
     near: float
     far: float
     mask: Bool[Tensor, "views height width"] | None = None
     depth: Float[Tensor, "views height width"] | None = None
+
+    @property
+    def images(self) -> Float[Tensor, "views 3 height width"]:
+        """Colours in [0, 1]."""
+        return self.pixels.float() / 255
 
 
 class SceneReader(Protocol):
@@ -39,15 +49,26 @@ class SceneReader(Protocol):
 
     near: float
     far: float
+    identity: str
+    """What is read and how (folder and settings): two readers of one identity read the same files alike."""
 
     def __len__(self) -> int:
         """Number of scenes."""
 
+    def fingerprint(self) -> str:
+        """Digest of the files that images and cameras come from (names, sizes, times of change)."""
+
+    def scene_id(self, index: int) -> str:
+        """Name of scene `index` within the dataset."""
+
     def view_names(self, index: int) -> tuple[str, ...]:
         """Sorted names of the views of scene `index`, without decoding images."""
 
-    def load(self, index: int, views: Sequence[int] | None = None) -> Scene:
+    def load(self, index: int, views: Sequence[int] | None = None, truth: bool = False) -> Scene:
         """Read the views at these positions of `view_names` (all where None).
+
+        Args:
+            truth: also read ground-truth mask and depth, where the dataset has them.
 
         Raises:
             DataError: a file is missing, damaged or inconsistent; the message names it.

@@ -1,0 +1,16 @@
+"""Predict held-out views and score them: `python src/evaluate.py ckpt=demo data=srn_cars strategy=none`."""
+
+from omegaconf import DictConfig
+
+from nerfdiff.cli import entry_point
+from nerfdiff.evaluation import evaluate
+
+
+@entry_point("evaluate")
+def main(cfg: DictConfig) -> float | None:
+    """Returns the strategy's PSNR, which a sweep may optimise."""
+    return evaluate(cfg)[0].psnr
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,76 @@
+"""Checkpoints a run can be resumed from, written so that a failure never costs the one before."""
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+from lightning import LightningModule, Trainer
+from lightning.fabric.plugins import TorchCheckpointIO
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.utilities.exceptions import SIGTERMException
+
+from nerfdiff.errors import CheckpointError
+
+
+class LastCheckpoint(ModelCheckpoint):
+    """`last.ckpt`: every n optimizer steps, and when a person or a scheduler stops the run.
+
+    On SIGTERM and Ctrl-C it saves only between optimizer steps: halfway through an accumulation window the
+    gradients gathered so far would be lost and the resumed run would differ from an uninterrupted one.
+
+    Args:
+        dirpath: folder of the checkpoints.
+        every_n_steps: optimizer steps between checkpoints.
+    """
+
+    def __init__(self, dirpath: str, every_n_steps: int):
+        super().__init__(
+            dirpath=dirpath,
+            filename="last",
+            every_n_train_steps=every_n_steps,
+            save_top_k=1,
+            enable_version_counter=False,
+        )
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        # Weights, their average and Adam's two moments; two files exist while one replaces the other.
+        needed = 2 * 4 * sum(p.numel() * p.element_size() for p in pl_module.parameters())
+        folder = Path(self.dirpath)
+        folder.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(folder).free
+        if free < needed:
+            raise CheckpointError(
+                f"{folder} has {free / 2**20:.0f} MiB free; checkpoints of this model need {needed / 2**20:.0f} MiB. "
+                "Free some space or choose another paths.runs_dir"
+            )
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self._last_global_step_saved != trainer.global_step:
+            self._save_checkpoint(trainer, self.format_checkpoint_name({}))
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        stopped = isinstance(exception, SIGTERMException | KeyboardInterrupt)
+        batches = trainer.fit_loop.epoch_loop.batch_progress.current
+        between_steps = batches.ready == batches.processed and batches.ready % trainer.accumulate_grad_batches == 0
+        unsaved = self._last_global_step_saved != trainer.global_step > 0
+        if stopped and between_steps and unsaved and not trainer.sanity_checking:
+            self._save_checkpoint(trainer, self.format_checkpoint_name({}))
+
+
+class ClearCheckpointIO(TorchCheckpointIO):
+    """Lightning's atomic checkpoint files, with a clear word when one cannot be written.
+
+    Raises:
+        CheckpointError: the file cannot be written; the checkpoint it was to replace is untouched.
+    """
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path, storage_options: Any = None) -> None:
+        try:
+            super().save_checkpoint(checkpoint, path, storage_options)
+        except OSError as error:
+            free = shutil.disk_usage(os.path.dirname(path)).free
+            raise CheckpointError(
+                f"cannot write {path}: {error.strerror or error} ({free / 2**20:.0f} MiB free). The checkpoint "
+                "before it is kept: free some space and run the same command again to go on from there"
+            ) from error

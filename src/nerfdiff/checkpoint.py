@@ -1,0 +1,162 @@
+"""From a file to a model: Lightning checkpoints and exported weights, always read as plain tensors."""
+
+import os
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from nerfdiff.errors import CheckpointError
+from nerfdiff.model import NerfDiff
+from nerfdiff.results.files import atomic, write_text
+
+WEIGHTS = "model.safetensors"
+CONFIG = "model.yaml"
+_PREFIX = "model."
+
+
+@dataclass(frozen=True)
+class LoadedModel:
+    """A model ready to use, and where it came from.
+
+    Args:
+        model: on the CPU, in evaluation mode.
+        path: the file its weights were read from.
+        weights: `ema` or `raw`.
+    """
+
+    model: NerfDiff
+    path: Path
+    weights: str
+
+
+def load_model(ckpt: str | Path, weights: str, assets: str | Path) -> LoadedModel:
+    """Read a model with the sizes it was trained with.
+
+    Args:
+        ckpt: a Lightning `.ckpt`; a run's folder (its last checkpoint); a folder written by `export_model`; or the
+            name of such a folder in `assets`, as `demo`.
+        weights: `ema`, the average that the paper evaluates, or `raw`.
+        assets: folder of shipped models.
+
+    Raises:
+        CheckpointError: no such file, not a checkpoint of this project, or it lacks these weights.
+    """
+    if weights not in ("ema", "raw"):
+        raise CheckpointError(f"weights must be ema or raw, got {weights!r}")
+    candidates = [Path(ckpt), Path(ckpt) / "checkpoints" / "last.ckpt", Path(ckpt) / WEIGHTS]
+    candidates.append(Path(assets) / ckpt / WEIGHTS)
+    path = next((c for c in candidates if c.is_file()), None)
+    if path is None:
+        shipped = sorted(p.parent.name for p in Path(assets).glob(f"*/{WEIGHTS}"))
+        raise CheckpointError(
+            f"ckpt={ckpt} is neither a file nor a folder of a run; looked for "
+            f"{', '.join(map(str, candidates))}. Shipped models: {', '.join(shipped) or 'none'}"
+        )
+    config, state = _read_export(path, weights) if path.suffix == ".safetensors" else _read_ckpt(path, weights)
+    return LoadedModel(_build(config, state, path), path, weights)
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """A Lightning checkpoint as plain data.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, or no checkpoint of this project.
+    """
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError as error:
+        raise CheckpointError(f"checkpoint {path} does not exist") from error
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CheckpointError(f"{path} is not a readable checkpoint ({reason})") from error
+    parameters = checkpoint.get("hyper_parameters", {}) if isinstance(checkpoint, dict) else {}
+    if "model" not in parameters or "state_dict" not in checkpoint:
+        raise CheckpointError(f"{path} is not a checkpoint of NerfDiffModule: it holds no model settings")
+    return checkpoint
+
+
+def export_model(model: NerfDiff, config: Mapping, folder: str | Path, dtype: torch.dtype) -> Path:
+    """Write weights (safetensors) and the model's settings (YAML) that rebuild it.
+
+    Args:
+        config: arguments of `NerfDiff`, as plain data.
+        dtype: of the stored weights.
+    """
+    folder = Path(folder)
+    state = {name: value.detach().to("cpu", dtype).contiguous() for name, value in model.state_dict().items()}
+    with atomic(folder / WEIGHTS) as temporary:
+        save_file(state, temporary)
+    write_text(folder / CONFIG, yaml.safe_dump(dict(config), sort_keys=False))
+    return folder / WEIGHTS
+
+
+def differences(old: Mapping, new: Mapping, prefix: str = "") -> list[str]:
+    """Settings that differ between two nested mappings, as `key: old → new`."""
+    found = []
+    for key in sorted(old.keys() | new.keys()):
+        before, after = old.get(key), new.get(key)
+        if isinstance(before, Mapping) and isinstance(after, Mapping):
+            found += differences(before, after, f"{prefix}{key}.")
+        elif before != after:
+            found.append(f"{prefix}{key}: {before} → {after}")
+    return found
+
+
+def check_resumable(path: str | Path, model_config: Mapping) -> None:
+    """Refuse to resume a run whose model has other settings.
+
+    Raises:
+        CheckpointError: naming every setting that differs.
+    """
+    changed = differences(read_checkpoint(path)["hyper_parameters"]["model"], model_config, "model.")
+    if changed:
+        raise CheckpointError(
+            f"{path} was trained with other settings ({'; '.join(changed)}). Resume with those, or choose another "
+            f"run_name to start afresh"
+        )
+
+
+def _read_ckpt(path: Path, weights: str) -> tuple[Mapping, dict[str, torch.Tensor]]:
+    checkpoint = read_checkpoint(path)
+    averaged = "current_model_state" in checkpoint
+    if weights == "ema" and not averaged:
+        raise CheckpointError(f"{path} holds no averaged weights (no EMA callback in that run): use weights=raw")
+    state = checkpoint["current_model_state" if weights == "raw" and averaged else "state_dict"]
+    return checkpoint["hyper_parameters"]["model"], {
+        name.removeprefix(_PREFIX): value for name, value in state.items() if name.startswith(_PREFIX)
+    }
+
+
+def _read_export(path: Path, weights: str) -> tuple[Mapping, dict[str, torch.Tensor]]:
+    if weights == "raw":
+        raise CheckpointError(f"{path} holds averaged weights only: use weights=ema")
+    settings = path.with_name(CONFIG)
+    if not settings.is_file():
+        raise CheckpointError(f"{settings} is missing: it holds the sizes that {path.name} was trained with")
+    try:
+        state = load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{path} is not a readable safetensors file ({error})") from error
+    return yaml.safe_load(settings.read_text()), state
+
+
+def _build(config: Mapping, state: dict[str, torch.Tensor], path: Path) -> NerfDiff:
+    try:
+        model = NerfDiff(**config)
+        model.load_state_dict({name: value.float() for name, value in state.items()})
+    except (TypeError, KeyError, RuntimeError) as error:
+        raise CheckpointError(f"{path} does not fit its own settings: {error}") from error
+    return model.eval()
+
+
+def find_last(folder: str | os.PathLike) -> Path | None:
+    """`last.ckpt` of a run's folder, if training has got that far."""
+    path = Path(folder) / "checkpoints" / "last.ckpt"
+    return path if path.is_file() else None

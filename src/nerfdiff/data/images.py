@@ -1,0 +1,71 @@
+"""Image files to 8-bit RGB on white, and their resizing."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image
+
+from nerfdiff.errors import DataError
+
+
+def decode(path: Path) -> UInt8[np.ndarray, "height width 3"]:
+    """Decode grey, palette, RGB or RGBA, 8 or 16 bits deep (of 16 the upper 8 are kept); alpha lies on white.
+
+    Raises:
+        DataError: the file is missing, truncated or no image.
+    """
+    image = _open(path)
+    if image.mode.startswith("I"):  # 16-bit grey, which Pillow would clip rather than scale
+        grey = (np.asarray(image) >> 8).astype(np.uint8)
+        return np.repeat(grey[..., None], 3, axis=-1)
+    if not image.has_transparency_data:
+        return np.asarray(image.convert("RGB"))
+    rgba = np.asarray(image.convert("RGBA")).astype(np.uint16)
+    colour, alpha = rgba[..., :3], rgba[..., 3:]
+    return ((colour * alpha + 255 * (255 - alpha) + 127) // 255).astype(np.uint8)
+
+
+def decode_mask(path: Path) -> Bool[np.ndarray, "height width"]:
+    """Decode an 8-bit mask: foreground is above half of white.
+
+    Raises:
+        DataError: as `decode`.
+    """
+    return np.asarray(_open(path).convert("L")) > 127
+
+
+def resize(
+    image: UInt8[np.ndarray, "height width 3"], size: tuple[int, int]
+) -> UInt8[np.ndarray, "new_height new_width 3"]:
+    """Resize to (height, width) without aliasing: exact area averages by whole factors, else a tent filter.
+
+    The image's borders stay where they are, as `Cameras.resized` assumes.
+    """
+    if image.shape[:2] == tuple(size):
+        return image
+    whole = all(old % new == 0 for old, new in zip(image.shape, size, strict=False))
+    kernel = Image.Resampling.BOX if whole else Image.Resampling.BILINEAR
+    return np.asarray(Image.fromarray(image).resize((size[1], size[0]), kernel))
+
+
+def resize_nearest(
+    values: Float[np.ndarray, "height width"] | Bool[np.ndarray, "height width"], size: tuple[int, int]
+) -> Float[np.ndarray, "new_height new_width"] | Bool[np.ndarray, "new_height new_width"]:
+    """Resize depth or masks, whose values must not be averaged over an edge."""
+    rows, columns = (
+        ((np.arange(new) + 0.5) * old / new).astype(int) for new, old in zip(size, values.shape, strict=True)
+    )
+    return values[rows[:, None], columns]
+
+
+def _open(path: Path) -> Image.Image:
+    try:
+        with Image.open(path) as image:
+            image.load()
+            return image
+    except FileNotFoundError as error:
+        raise DataError(f"{path}: no such image") from error
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        reason = str(error).replace(str(path), "it").replace(repr(str(path)), "it")
+        raise DataError(f"{path}: not a whole image ({reason}); copy or render it anew") from error

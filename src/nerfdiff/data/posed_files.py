@@ -1,0 +1,69 @@
+"""Poses and intrinsics in text files, checked as they are read."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from nerfdiff.errors import DataError
+
+RIGID_TOLERANCE = 1e-3
+"""Largest deviation of R·Rᵀ from the identity that rounding in a text file explains."""
+
+
+def read_numbers(path: Path, counts: tuple[int, ...], what: str) -> Float[np.ndarray, " count"]:
+    """Read all numbers of a text file, on however many lines.
+
+    Raises:
+        DataError: the file is missing, is no text of numbers, or holds another count than one of `counts`.
+    """
+    expected = f"expected {what}: {' or '.join(map(str, counts))} finite numbers"
+    words = read_text(path, expected).split()
+    try:
+        numbers = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise DataError(f"{path}: {expected} ({error})") from error
+    if len(numbers) not in counts:
+        raise DataError(f"{path}: {expected}, found {len(numbers)}")
+    if not np.isfinite(numbers).all():
+        raise DataError(f"{path}: {expected}, found NaN or infinity")
+    return numbers
+
+
+def read_text(path: Path, expected: str) -> str:
+    """The file's text.
+
+    Raises:
+        DataError: the file cannot be read; the message says what was `expected` in it.
+    """
+    try:
+        return path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: {expected}, but it cannot be read ({error})") from error
+
+
+def read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
+    """Read a row-major rigid 4×4 matrix of 16 numbers.
+
+    Raises:
+        DataError: as `read_numbers`, or the matrix is not a rotation and a translation.
+    """
+    pose = read_numbers(path, (16,), "a row-major 4x4 pose").reshape(4, 4)
+    rotation = pose[:3, :3]
+    deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if deviation > RIGID_TOLERANCE or np.abs(pose[3] - [0, 0, 0, 1]).max() > RIGID_TOLERANCE:
+        raise DataError(
+            f"{path}: the pose is not rigid (R·Rᵀ is off the identity by {deviation:.2g}, "
+            f"last row {pose[3].tolist()}); expected a rotation and a translation, with no scale"
+        )
+    if np.linalg.det(rotation) < 0:
+        raise DataError(f"{path}: the pose mirrors space (det R < 0); expected a right-handed rotation")
+    return pose
+
+
+def inverse_pose(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """The inverse of a rigid transform."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse

@@ -1,0 +1,232 @@
+"""SRN-ShapeNet cars and chairs, and every dataset written in their layout.
+
+    <root>/cars_train/<id>/{intrinsics.txt, rgb/000000.png …, pose/000000.txt …}
+    <root>/chairs_train/chairs_2.0_train/<id>/…
+
+Poses are camera-to-world with OpenCV axes in a z-up world, so nothing needs converting.
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from nerfdiff.cameras import Cameras
+from nerfdiff.data import images
+from nerfdiff.data.fingerprint import fingerprint_folders
+from nerfdiff.data.posed_files import inverse_pose, read_pose
+from nerfdiff.data.scene import MissingSplit, Scene
+from nerfdiff.data.srn_intrinsics import SceneIntrinsics, read_view_intrinsics
+from nerfdiff.errors import ConfigError, DataError
+
+SPLITS = ("train", "val", "test")
+PARENTS = ("", "srn_{category}", "srn_{category}/srn_{category}")
+FOLDERS = {"cars": ("cars_{split}",), "chairs": ("chairs_{split}/chairs_2.0_{split}", "chairs_{split}")}
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+@dataclass(frozen=True)
+class _Folder:
+    """The files of one scene, listed but not read."""
+
+    path: Path
+    views: tuple[str, ...]
+    rgb: tuple[Path, ...]
+
+
+class SRNReader:
+    """One split of an SRN-layout dataset.
+
+    Args:
+        root: the folder that holds `cars_train`, or that holds it within `srn_cars/` or `srn_cars/srn_cars/`.
+        category: "cars" or "chairs".
+        split: "train", "val" or "test".
+        near, far: bounds of every scene as distances along rays.
+        image_size: (height, width), or one side of a square, to resize to; None keeps the stored size.
+
+    Raises:
+        ConfigError: an unknown category or split, or bounds that are not 0 < near < far.
+        MissingSplit: `root` has no such split; the message lists what was looked for.
+        DataError: `root` is missing or empty, or the split has no scenes.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        category: str,
+        split: str,
+        near: float,
+        far: float,
+        image_size: int | Sequence[int] | None = None,
+    ):
+        if category not in FOLDERS:
+            raise ConfigError(f"SRN category {category!r} is unknown; choose one of {', '.join(FOLDERS)}")
+        if split not in SPLITS:
+            raise ConfigError(f"split {split!r} is unknown; choose one of {', '.join(SPLITS)}")
+        if not 0 < near < far:
+            raise ConfigError(f"near = {near} and far = {far} must satisfy 0 < near < far")
+        self.near, self.far = float(near), float(far)
+        self.image_size = _height_width(image_size)
+        self.folder = _find_split(Path(root), category, split)
+        self.scenes = tuple(
+            sorted(e.name for e in os.scandir(self.folder) if e.is_dir() and not e.name.startswith("."))
+        )
+        if not self.scenes:
+            raise DataError(f"{self.folder}: the {split} split is empty; expected one folder per scene in it")
+        self.identity = f"srn {self.folder.resolve()} {self.image_size}"
+        self._listed: dict[int, _Folder] = {}
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def fingerprint(self) -> str:
+        parts = ("", "rgb", "pose", "intrinsics")
+        return fingerprint_folders(self.folder / scene / part for scene in self.scenes for part in parts)
+
+    def scene_id(self, index: int) -> str:
+        return self.scenes[index]
+
+    def view_names(self, index: int) -> tuple[str, ...]:
+        return self._list(index).views
+
+    def load(self, index: int, views: Sequence[int] | None = None, truth: bool = False) -> Scene:
+        folder = self._list(index)
+        positions = range(len(folder.views)) if views is None else views
+        names = tuple(folder.views[p] for p in positions)
+        stored = [images.decode(folder.rgb[p]) for p in positions]
+        shared = _shared_intrinsics(folder.path)
+        K = self._intrinsics(folder, names, [image.shape[:2] for image in stored], shared)
+        if self.image_size is not None:
+            stored = [images.resize(image, self.image_size) for image in stored]
+        for position, image in zip(positions, stored, strict=True):
+            if image.shape != stored[0].shape:
+                raise DataError(
+                    f"{folder.rgb[position]}: {image.shape[0]}x{image.shape[1]} pixels, other views of the "
+                    f"scene have {stored[0].shape[0]}x{stored[0].shape[1]}; set data.image_size to resize all"
+                )
+        height, width = stored[0].shape[:2]
+        poses = [read_pose(folder.path / "pose" / f"{name}.txt") for name in names]
+        if shared is not None and shared.world2cam:
+            poses = [inverse_pose(pose) for pose in poses]
+        return Scene(
+            id=self.scenes[index],
+            views=names,
+            pixels=torch.from_numpy(np.stack(stored)).permute(0, 3, 1, 2).contiguous(),
+            cameras=Cameras(torch.from_numpy(np.stack(poses)).float(), torch.from_numpy(K).float(), height, width),
+            near=self.near,
+            far=self.far,
+            mask=self._truth(folder, names, "mask", (height, width)) if truth else None,
+            depth=self._truth(folder, names, "depth", (height, width)) if truth else None,
+        )
+
+    def _list(self, index: int) -> _Folder:
+        if index not in self._listed:
+            path = self.folder / self.scenes[index]
+            rgb = _files_by_stem(path / "rgb", IMAGE_SUFFIXES)
+            pose = _files_by_stem(path / "pose", (".txt",))
+            if rgb.keys() != pose.keys():
+                raise DataError(
+                    f"{path}: {len(rgb)} images in rgb/ and {len(pose)} poses in pose/ do not match by name; "
+                    f"images without a pose: {_some(rgb.keys() - pose.keys())}; "
+                    f"poses without an image: {_some(pose.keys() - rgb.keys())}"
+                )
+            self._listed[index] = _Folder(path, tuple(sorted(rgb)), tuple(rgb[name] for name in sorted(rgb)))
+        return self._listed[index]
+
+    def _intrinsics(
+        self,
+        folder: _Folder,
+        names: Sequence[str],
+        sizes: Sequence[tuple[int, int]],
+        shared: SceneIntrinsics | None,
+    ) -> Float[np.ndarray, "views 3 3"]:
+        """K of each view, at the size at which it will be returned."""
+        if shared is not None:
+            K = np.stack([shared.K(*size) for size in sizes])
+        else:
+            files = [folder.path / "intrinsics" / f"{name}.txt" for name in names]
+            K = np.stack([read_view_intrinsics(f, *size) for f, size in zip(files, sizes, strict=True)])
+        if self.image_size is not None:
+            scale = np.array([[self.image_size[1] / w, self.image_size[0] / h, 1] for h, w in sizes])
+            K = K * scale[:, :, None]
+        return K
+
+    def _truth(self, folder: _Folder, names: Sequence[str], kind: str, size: tuple[int, int]):
+        """`mask/<view>.png` or `depth/<view>.npz` of generated scenes; None where the folder is not there."""
+        if not (folder.path / kind).is_dir():
+            return None
+        read, suffix = (images.decode_mask, "png") if kind == "mask" else (_read_depth, "npz")
+        values = [read(folder.path / kind / f"{name}.{suffix}") for name in names]
+        return torch.from_numpy(np.stack([images.resize_nearest(value, size) for value in values]))
+
+
+def _height_width(image_size: int | Sequence[int] | None) -> tuple[int, int] | None:
+    if image_size is None:
+        return None
+    size = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
+    if len(size) != 2 or not all(isinstance(side, int) and side > 0 for side in size):
+        raise ConfigError(f"image_size {image_size!r} is neither a side in pixels nor [height, width]")
+    return size
+
+
+def _shared_intrinsics(scene: Path) -> SceneIntrinsics | None:
+    """`intrinsics.txt`; None for the flavour that has a file per view instead."""
+    file = scene / "intrinsics.txt"
+    if not file.exists() and (scene / "intrinsics").is_dir():
+        return None
+    return SceneIntrinsics.read(file)
+
+
+def _find_split(root: Path, category: str, split: str) -> Path:
+    wanted = [
+        Path(parent.format(category=category)) / folder.format(split=split)
+        for parent in PARENTS
+        for folder in FOLDERS[category]
+    ]
+    looked_for = ", ".join(str(w) for w in wanted)
+    if not root.is_dir():
+        raise DataError(f"{root}: no such folder; set data.root to the folder that holds one of {looked_for}")
+    for folder in wanted:
+        if (root / folder).is_dir():
+            return root / folder
+    found = sorted(entry.name for entry in root.iterdir())
+    if not found:
+        raise DataError(f"{root}: the folder is empty; expected one of {looked_for} in it")
+    raise MissingSplit(
+        f"{root}: no {split} split of SRN {category}; looked for {looked_for}; found only {_some(found)}"
+    )
+
+
+def _files_by_stem(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
+    """Files with one of these suffixes; a stray or half-copied file shows as a view that has no partner."""
+    if not folder.is_dir():
+        raise DataError(f"{folder}: no such folder; every scene of an SRN layout has rgb/ and pose/")
+    files = [f for f in folder.iterdir() if f.suffix.lower() in suffixes and not f.name.startswith(".")]
+    if not files:
+        raise DataError(f"{folder}: no {' or '.join(suffixes)} files in it")
+    by_stem = {file.stem: file for file in files}
+    if len(by_stem) < len(files):
+        raise DataError(f"{folder}: {len(files) - len(by_stem)} views are there twice, under several suffixes")
+    return by_stem
+
+
+def _read_depth(path: Path) -> Float[np.ndarray, "height width"]:
+    try:
+        with np.load(path) as arrays:
+            depth = arrays["depth"].astype(np.float32)
+    except (OSError, KeyError, ValueError, BadZipFile) as error:
+        raise DataError(f"{path}: expected an npz file with an array 'depth' ({error})") from error
+    if depth.ndim != 2 or not np.isfinite(depth).all():
+        raise DataError(f"{path}: expected a finite [height, width] depth, found shape {depth.shape}")
+    return depth
+
+
+def _some(names: Sequence[str], limit: int = 8) -> str:
+    names = sorted(names)
+    more = f" and {len(names) - limit} more" if len(names) > limit else ""
+    return (", ".join(names[:limit]) or "none") + more

@@ -1,0 +1,85 @@
+"""The two flavours of intrinsics in SRN-layout datasets."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from nerfdiff.data.posed_files import read_numbers, read_text
+from nerfdiff.errors import DataError
+
+ASPECT_TOLERANCE = 0.02
+"""How far the two scale factors may differ by rounding of the image size (640×480 stored as 107×80)."""
+
+
+@dataclass(frozen=True)
+class SceneIntrinsics:
+    """`intrinsics.txt`: one pinhole for the whole scene, given for images of `height` × `width`.
+
+    f cx cy _
+    _ _ _
+    _
+    height width
+    [1 where the pose files are world2cam, else 0]
+    """
+
+    path: Path
+    f: float
+    cx: float
+    cy: float
+    height: float
+    width: float
+    world2cam: bool
+
+    @staticmethod
+    def read(path: Path) -> "SceneIntrinsics":
+        """Parse the file.
+
+        Raises:
+            DataError: it is not of the above form, or no pinhole has these numbers.
+        """
+        form = "expected intrinsics as lines 'f cx cy _', '_ _ _', '_', 'height width' and optionally '0' or '1'"
+        lines = [line.split() for line in read_text(path, form).splitlines() if line.strip()]
+        try:
+            f, cx, cy = (float(word) for word in lines[0][:3])
+            height, width = (float(word) for word in lines[3])
+            world2cam = bool([["0"], ["1"]].index(lines[4])) if len(lines) > 4 else False
+        except (IndexError, ValueError) as error:
+            raise DataError(f"{path}: {form} ({error})") from error
+        if not (np.isfinite(f) and f > 0 and 0 < cx < width < np.inf and 0 < cy < height < np.inf):
+            raise DataError(
+                f"{path}: f = {f:g}, (cx, cy) = ({cx:g}, {cy:g}) and a size of {height:g}x{width:g} are no "
+                "pinhole; expected f > 0 and a principal point inside the image"
+            )
+        return SceneIntrinsics(path, f, cx, cy, height, width, world2cam)
+
+    def K(self, height: int, width: int) -> Float[np.ndarray, "3 3"]:
+        """Intrinsics of an image stored at `height` × `width`, which may be another resolution.
+
+        Raises:
+            DataError: the image is not the same view at another resolution.
+        """
+        sx, sy = width / self.width, height / self.height
+        if abs(sx / sy - 1) > ASPECT_TOLERANCE:
+            raise DataError(
+                f"{self.path}: intrinsics are for {self.height:g}x{self.width:g}, but the images are "
+                f"{height}x{width}, of another aspect; correct its line 'height width'"
+            )
+        return np.array([[self.f * sx, 0, self.cx * sx], [0, self.f * sy, self.cy * sy], [0, 0, 1]])
+
+
+def read_view_intrinsics(path: Path, height: int, width: int) -> Float[np.ndarray, "3 3"]:
+    """`intrinsics/<view>.txt`: a 3×3 K of the stored image.
+
+    Raises:
+        DataError: the numbers are no K of an image of `height` × `width`.
+    """
+    K = read_numbers(path, (9,), "a row-major 3x3 K").reshape(3, 3)
+    pinhole = K[0, 0] > 0 and K[1, 1] > 0 and 0 < K[0, 2] < width and 0 < K[1, 2] < height
+    if not pinhole or K[0, 1] or K[1, 0] or not np.array_equal(K[2], [0, 0, 1]):
+        raise DataError(
+            f"{path}: {K.tolist()} is no K of a {height}x{width} image; expected [[fx, 0, cx], [0, fy, cy], "
+            "[0, 0, 1]] in pixels with a principal point inside the image"
+        )
+    return K

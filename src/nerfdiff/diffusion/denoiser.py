@@ -1,0 +1,81 @@
+"""The 3D-aware conditional diffusion model (paper, "3D-aware Conditional Diffusion Models")."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerfdiff.cameras import Cameras
+from nerfdiff.diffusion.schedule import alpha_sigma, expand, x0_from_v
+from nerfdiff.diffusion.unet import UNet
+from nerfdiff.errors import ConfigError
+
+IMAGES = ("rendered", "source", "none")
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What the CDM may look at. All share the batch axis, one entry per view to denoise.
+
+    Args:
+        rendered: the single-image NeRF's image of the view, in [0, 1].
+        source: the input image, in [0, 1].
+        cameras: cameras of the views, in the input camera's space.
+        near: t_n per view, to which camera positions are relative.
+        features: the encoder's features.
+    """
+
+    rendered: Float[Tensor, "batch 3 height width"]
+    source: Float[Tensor, "batch 3 height width"]
+    cameras: Cameras
+    near: Float[Tensor, "batch"]
+    features: Sequence[Tensor]
+
+
+class Denoiser(nn.Module):
+    """ADM U-Net over [Z_t, condition], v-prediction inside, x0 outside. Images live in [-1, 1] here.
+
+    Args:
+        image: which image is concatenated with Z_t: `rendered` (the paper's), `source` or `none`.
+        ray_maps: concatenate the origin and direction of every pixel's ray in the input camera's space. Without
+            a rendered image nothing else tells the CDM which view is wanted.
+        cross_attention: attend to the encoder's features after every attention block.
+        unet: the U-Net's sizes.
+    """
+
+    def __init__(self, image: str, ray_maps: bool, cross_attention: bool, unet: Mapping):
+        super().__init__()
+        if image not in IMAGES:
+            raise ConfigError(f"conditioning.image must be one of {', '.join(IMAGES)}, got {image!r}")
+        if image != "rendered" and not ray_maps:
+            raise ConfigError(
+                f"conditioning.image={image} does not show the CDM which view is wanted: set conditioning.ray_maps=true"
+            )
+        self.image = image
+        self.ray_maps = ray_maps
+        channels = 3 + 3 * (image != "none") + 6 * ray_maps
+        self.unet = UNet(channels, 3, **unet, with_time=True, cross_attention=cross_attention, zero_output=True)
+        self.cross_attention = cross_attention
+
+    def velocity(
+        self, z: Float[Tensor, "batch 3 height width"], t: Float[Tensor, "batch"], condition: Condition
+    ) -> Float[Tensor, "batch 3 height width"]:
+        """The predicted v_t."""
+        inputs = [z]
+        if self.image != "none":
+            inputs.append(2 * getattr(condition, self.image) - 1)
+        if self.ray_maps:
+            rays = condition.cameras.rays(condition.near, condition.near)
+            origins = rays.origins / rays.near[..., None]
+            inputs.append(torch.cat([origins, rays.directions], -1).movedim(-1, 1))
+        context = condition.features if self.cross_attention else ()
+        return self.unet(torch.cat(inputs, 1), t, context)[0].float()
+
+    def forward(
+        self, z: Float[Tensor, "batch 3 height width"], t: Float[Tensor, "batch"], condition: Condition
+    ) -> Float[Tensor, "batch 3 height width"]:
+        """The denoised images x0."""
+        alpha, sigma = (expand(c, z) for c in alpha_sigma(t))
+        return x0_from_v(z, self.velocity(z, t, condition), alpha, sigma)

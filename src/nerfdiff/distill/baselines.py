@@ -1,0 +1,42 @@
+"""Two honest baselines that know nothing of 3D: any method worth running beats both."""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfdiff.data.batch import ViewBatch
+from nerfdiff.data.scene import SceneReader
+from nerfdiff.distill.strategy import Views
+from nerfdiff.randomness import generator
+
+
+@dataclass(frozen=True)
+class CopyInput:
+    """Every view looks like the input view."""
+
+    name: str = "copy_input"
+
+    def predict(self, model: None, scene: ViewBatch, seed: int) -> Views:
+        return Views(scene.source.expand(scene.targets.shape[1], -1, -1, -1))
+
+
+@dataclass(frozen=True)
+class MeanImage:
+    """Every view looks like the mean of the training images."""
+
+    mean: Float[Tensor, "3 height width"]
+    name: str = "mean_image"
+
+    def predict(self, model: None, scene: ViewBatch, seed: int) -> Views:
+        mean = F.interpolate(self.mean[None], scene.targets.shape[-2:], mode="area")
+        return Views(mean.expand(scene.targets.shape[1], -1, -1, -1).to(scene.source))
+
+
+def mean_training_image(reader: SceneReader, scenes: int, seed: int) -> Float[Tensor, "3 height width"]:
+    """Mean over all views of up to `scenes` training scenes, chosen by `seed`."""
+    order = torch.randperm(len(reader), generator=generator("cpu", seed, "mean image"))
+    means = [reader.load(int(index)).images.mean(0) for index in order[:scenes]]
+    return torch.stack(means).mean(0)

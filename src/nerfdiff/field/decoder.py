@@ -1,0 +1,35 @@
+"""The NeRF module f_θ: a shallow MLP on triplane features (paper, "Implementation Details")."""
+
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerfdiff.precision import at_least_single
+
+
+class Decoder(nn.Module):
+    """Two linear layers from ξ_W(x) to colour and density. No view direction: colour is a property of the point.
+
+    Args:
+        channels: feature channels of the triplane.
+        hidden: width of the hidden layer.
+        density_shift: added before the softplus, so that space starts out nearly empty.
+        density_scale: density in units of 1 / (t_f − t_n) where the softplus gives 1; making density relative to
+            the frustum's depth frees the network from the scene's units.
+    """
+
+    def __init__(self, channels: int, hidden: int, density_shift: float, density_scale: float):
+        super().__init__()
+        self.hidden = nn.Linear(channels, hidden)
+        self.output = nn.Linear(hidden, 4)
+        self.density_shift = density_shift
+        self.density_scale = density_scale
+
+    def forward(
+        self, features: Float[Tensor, "*points channels"]
+    ) -> tuple[Float[Tensor, "*points 3"], Float[Tensor, "*points"]]:
+        """Colour in [0, 1], and density per unit of the frustum's depth, both fp32."""
+        out = at_least_single(self.output(F.silu(self.hidden(features))))
+        # Softplus: exp overflows in half precision, and a ReLU dies on white backgrounds.
+        density = self.density_scale * F.softplus(out[..., 3] + self.density_shift)
+        return out[..., :3].sigmoid(), density

@@ -1,0 +1,65 @@
+"""The image encoder e_ψ: one image to a camera-aligned triplane, and features for the CDM to attend to."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerfdiff.cameras import Cameras
+from nerfdiff.diffusion.unet import UNet
+from nerfdiff.field.triplane import Triplane
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """What is known of a scene after one look: computed once per input image, whatever follows.
+
+    Args:
+        source: the input images in [0, 1].
+        triplane: W = e_ψ(I^s).
+        features: the encoder's features after each attention block.
+    """
+
+    source: Float[Tensor, "batch 3 height width"]
+    triplane: Triplane
+    features: list[Float[Tensor, "batch _c _h _w"]]
+
+    def repeat(self, n: int) -> "Encoding":
+        """Each scene n times in a row, to go with n views per scene flattened into the batch axis."""
+        t = self.triplane
+        triplane = replace(
+            t,
+            planes=t.planes.repeat_interleave(n, 0),
+            cameras=Cameras(
+                t.cameras.c2w.repeat_interleave(n, 0),
+                t.cameras.K.repeat_interleave(n, 0),
+                t.cameras.height,
+                t.cameras.width,
+            ),
+            near=t.near.repeat_interleave(n),
+            far=t.far.repeat_interleave(n),
+        )
+        features = [f.repeat_interleave(n, 0) for f in self.features]
+        return Encoding(self.source.repeat_interleave(n, 0), triplane, features)
+
+
+class Encoder(nn.Module):
+    """An ADM U-Net without time whose output is cut into three planes of the image's resolution."""
+
+    def __init__(self, channels: int, unet: Mapping):
+        super().__init__()
+        self.channels = channels
+        self.unet = UNet(3, 3 * channels, **unet, with_time=False, cross_attention=False, zero_output=False)
+
+    def forward(
+        self,
+        source: Float[Tensor, "batch 3 height width"],
+        cameras: Cameras,
+        near: Float[Tensor, "batch"],
+        far: Float[Tensor, "batch"],
+    ) -> Encoding:
+        """Encode input images in [0, 1] seen by `cameras` [batch]."""
+        out, features = self.unet(2 * source - 1)
+        planes = out.float().unflatten(1, (3, self.channels))
+        return Encoding(source, Triplane(planes, cameras, near, far), features)

@@ -1,0 +1,107 @@
+"""Learned perceptual distances: LPIPS with VGG16, and its shift-tolerant sibling, which needs no download.
+
+Neither class is an `nn.Module`: a metric held by a LightningModule stays out of its checkpoints and its EMA.
+"""
+
+from importlib.resources import as_file, files
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import interpolate
+from torchvision.models import VGG16_Weights
+
+from nerfdiff.metrics.weights import WeightsFile
+
+LPIPS_NET = "vgg16"
+LPIPS_VGG = WeightsFile(
+    url=VGG16_Weights.IMAGENET1K_V1.url, sha256="397923af", column="lpips", key="metrics.lpips_weights"
+)
+
+
+def at_least(images: Float[Tensor, "n 3 h w"], size: int) -> Float[Tensor, "n 3 H W"]:
+    """Images whose shorter side is below `size` pixels, enlarged bilinearly until it is; others as they are.
+
+    VGG halves its input four times, and reflects it at the border in the shift-tolerant variant.
+    """
+    if (shorter := min(images.shape[-2:])) >= size:
+        return images
+    height, width = (round(side * size / shorter) for side in images.shape[-2:])
+    return interpolate(images, (height, width), mode="bilinear", align_corners=False)
+
+
+class LPIPS:
+    """LPIPS v0.1 on VGG16 (Zhang et al., 2018) as torchmetrics computes it.
+
+    Args:
+        weights: torchvision's VGG16 weights on ImageNet, from `LPIPS_VGG.find`. The linear layers come with
+            torchmetrics.
+        min_size: see `at_least`, in pixels.
+    """
+
+    def __init__(self, weights: Path, device: torch.device | str = "cpu", min_size: int = 32):
+        # torchmetrics' public class loads its backbone by URL only; this is the network inside it.
+        from torchmetrics.functional.image.lpips import _NoTrainLpips
+
+        with torch.random.fork_rng(devices=[]):
+            net = _NoTrainLpips(net="vgg", pnet_rand=True)
+        published = torch.load(weights, map_location="cpu", weights_only=True)
+        backbone = {}
+        for key in net.net.state_dict():
+            _, layer = key.split(".", 1)
+            backbone[key] = published[f"features.{layer}"]
+        net.net.load_state_dict(backbone)
+        self.net = net.to(device)
+        self.device, self.min_size = torch.device(device), min_size
+
+    @torch.no_grad()
+    def __call__(self, predictions: Float[Tensor, "n 3 h w"], truth: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n"]:
+        """Distance of each pair of images in [0, 1] (the network sees [−1, 1]), on the CPU."""
+        pair = (at_least(x.float().to(self.device), self.min_size) for x in (predictions, truth))
+        return self.net(*pair, normalize=True).flatten().cpu()
+
+
+class STLPIPS:
+    """Shift-tolerant LPIPS on VGG16 (Ghildyal and Liu, 2022); its weights come with the package.
+
+    Args:
+        min_size: see `at_least`, in pixels; the network takes 20 and more.
+    """
+
+    def __init__(self, device: torch.device | str = "cpu", min_size: int = 32):
+        from stlpips_pytorch import stlpips  # imports IPython, which takes seconds
+
+        # On the meta device no time (or random state) goes into weights that are replaced at once.
+        with torch.device("meta"):
+            net = stlpips.LPIPS(net="vgg", variant="shift_tolerant", pretrained=False, verbose=False)
+        with as_file(files("stlpips_pytorch") / "weights" / "vST0.0" / "vgg_shift_tolerant.pth") as path:
+            weights = torch.load(path, map_location="cpu", weights_only=True)
+        # The file names every linear layer once (lin0); the module also knows it as lins.0, the same object.
+        weights |= {f"lins.{i}.model.1.weight": weights[f"lin{i}.model.1.weight"] for i in range(5)}
+        net.load_state_dict(weights, assign=True)
+        self.net = net.requires_grad_(False).eval().to(device)
+        self.device, self.min_size = torch.device(device), min_size
+        self._deepest: list[Tensor] = []
+        self.net.net.slice5.register_forward_hook(self._keep)
+
+    def _keep(self, module: nn.Module, inputs: tuple[Tensor], output: Tensor) -> None:
+        self._deepest.append(output.mean(dim=(2, 3)))
+
+    @torch.no_grad()
+    def __call__(
+        self, predictions: Float[Tensor, "n 3 h w"], truth: Float[Tensor, "n 3 h w"]
+    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 512"], Float[Tensor, "n 512"]]:
+        """Compare images in [0, 1] (the network sees [−1, 1]).
+
+        Returns:
+            the distance of each pair, and the features of predictions and of truth for a Fréchet distance:
+            the deepest activations (relu5_3, 512 channels, not normalised), averaged over the image. All on
+            the CPU.
+        """
+        pair = (at_least(x.float().to(self.device), self.min_size) for x in (predictions, truth))
+        self._deepest.clear()
+        distance = self.net(*pair, normalize=True).flatten().cpu()
+        first, second = (features.cpu() for features in self._deepest)
+        self._deepest.clear()
+        return distance, first, second

@@ -1,0 +1,91 @@
+"""From per-image numbers to one number: mean over a scene's images, then mean over scenes."""
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+
+from nerfdiff.results.files import atomic
+
+IMAGE_METRICS = (
+    "psnr",
+    "ssim",
+    "ssim_gaussian",
+    "lpips",
+    "st_lpips_vgg",
+    "depth_abs_rel",
+    "depth_rmse",
+    "mask_iou",
+)
+
+Value = float | int | str | None
+
+
+@dataclass(frozen=True)
+class SceneScores:
+    """Per-image numbers of one scene.
+
+    Args:
+        blank: all target images are white, so there is nothing to predict.
+        values: for each of `IMAGE_METRICS` that was measured, one value (or None) per view.
+    """
+
+    scene_id: str
+    views: tuple[str, ...]
+    blank: bool
+    values: Mapping[str, Sequence[float | None]]
+
+    def mean(self, metric: str) -> float | None:
+        return _mean(self.values.get(metric, ()))
+
+    def image_rows(self) -> list[dict[str, Value]]:
+        rows = []
+        for i, view in enumerate(self.views):
+            measured = {m: values[i] for m, values in self.values.items()}
+            rows.append({"scene": self.scene_id, "view": view} | measured)
+        return rows
+
+    def row(self) -> dict[str, Value]:
+        means = {m: self.mean(m) for m in IMAGE_METRICS}
+        return {"scene": self.scene_id, "views": len(self.views), "blank": int(self.blank)} | means
+
+
+def summarise(scenes: Sequence[SceneScores]) -> dict[str, Value]:
+    """Means over scenes of each metric; None where no image has a value.
+
+    Blank scenes count. Where there are any, `<metric>_without_blank` says what the others alone give.
+    """
+    summary: dict[str, Value] = {
+        "n_scenes": len(scenes),
+        "n_views": sum(len(scene.views) for scene in scenes),
+        "blank_scenes": sum(scene.blank for scene in scenes),
+    }
+    summary |= {m: _mean([scene.mean(m) for scene in scenes]) for m in IMAGE_METRICS}
+    if summary["blank_scenes"]:
+        others = [scene for scene in scenes if not scene.blank]
+        for m in ("psnr", "ssim", "lpips", "st_lpips_vgg"):
+            summary[f"{m}_without_blank"] = _mean([scene.mean(m) for scene in others])
+    return summary
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Value]]) -> None:
+    """Write rows under a header, atomically; what was not measured is an empty cell."""
+    with atomic(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns, restval="")
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({k: _cell(v) for k, v in row.items()})
+
+
+def _cell(value: Value) -> Value:
+    return f"{value:.8g}" if isinstance(value, float) else value
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """Mean of what was measured; NaN if any of it is NaN."""
+    known = [v for v in values if v is not None]
+    if not known:
+        return None
+    return math.nan if any(math.isnan(v) for v in known) else fmean(known)

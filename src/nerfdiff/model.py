@@ -1,0 +1,88 @@
+"""NerfDiff: the single-image NeRF and the CDM, side by side, free of any training framework."""
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerfdiff.cameras import Cameras
+from nerfdiff.diffusion.denoiser import Condition, Denoiser
+from nerfdiff.field.decoder import Decoder
+from nerfdiff.field.encoder import Encoder, Encoding
+from nerfdiff.field.field import TriplaneField
+from nerfdiff.render.renderer import Renderer, Rendering
+
+
+class NerfDiff(nn.Module):
+    """Encoder e_ψ, decoder f_θ, renderer and CDM ε_φ.
+
+    Args:
+        name: of the size, for records.
+        unet: sizes shared by the encoder and the CDM ("the image encoder retains the same architecture").
+        field: `channels` of the triplane, and the decoder's `hidden`, `density_shift`, `density_scale`.
+        render: the `Renderer`'s settings.
+        conditioning: `image`, `ray_maps`, `cross_attention` of the CDM, and a `name` for records.
+    """
+
+    def __init__(self, name: str, unet: Mapping, field: Mapping, render: Mapping, conditioning: Mapping):
+        super().__init__()
+        self.name = name
+        field, conditioning = dict(field), dict(conditioning)
+        self.conditioning = conditioning.pop("name")
+        channels = field.pop("channels")
+        self.encoder = Encoder(channels, unet)
+        self.decoder = Decoder(channels, **field)
+        self.renderer = Renderer(**render)
+        self.denoiser = Denoiser(**conditioning, unet=unet)
+
+    def encode(
+        self,
+        source: Float[Tensor, "batch 3 height width"],
+        cameras: Cameras,
+        near: Float[Tensor, "batch"],
+        far: Float[Tensor, "batch"],
+    ) -> Encoding:
+        """Input images in [0, 1] to triplanes and features."""
+        return self.encoder(source, cameras, near, far)
+
+    def field(self, encoding: Encoding) -> TriplaneField:
+        """The radiance field of each scene."""
+        return TriplaneField(encoding.triplane, self.decoder)
+
+    def render(
+        self,
+        encoding: Encoding,
+        cameras: Cameras,
+        jitter: Float[Tensor, "batch n samples"] | None = None,
+    ) -> Rendering:
+        """Render views [batch, views] given in the input cameras' space: leading shape [batch, views, h, w]."""
+        triplane = encoding.triplane
+        return self.renderer.render_views(self.field(encoding), cameras, triplane.near, triplane.far, jitter)
+
+    def condition(self, encoding: Encoding, cameras: Cameras, rendering: Rendering) -> Condition:
+        """What the CDM sees of views [batch, views], flattened into one batch axis of batch · views."""
+        views = cameras.shape[1]
+        repeated = encoding.repeat(views)
+        rendered = rendering.rgb.flatten(0, 1).movedim(-1, 1)
+        return Condition(rendered, repeated.source, cameras.flatten(), repeated.triplane.near, repeated.features)
+
+    def denoise(
+        self, z: Float[Tensor, "batch 3 height width"], t: Tensor, condition: Condition
+    ) -> Float[Tensor, "batch 3 height width"]:
+        """x0 in [-1, 1] from Z_t; `t` may be a scalar."""
+        return self.denoiser(z, t.expand(z.shape[0]), condition)
+
+    def parameter_count(self) -> dict[str, int]:
+        """Parameters of each part and in all."""
+        parts = {
+            part: sum(p.numel() for p in getattr(self, part).parameters())
+            for part in ("encoder", "decoder", "denoiser")
+        }
+        return parts | {"total": sum(parts.values())}
+
+
+def build_on_meta(config: Mapping) -> NerfDiff:
+    """The model on the meta device: shapes and counts without memory."""
+    with torch.device("meta"):
+        return NerfDiff(**config)

@@ -1,0 +1,126 @@
+"""The reference volume renderer: plain PyTorch, bounded memory."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from nerfdiff.cameras import Cameras, Rays
+from nerfdiff.field.field import FieldFn
+from nerfdiff.render.compositing import compositing_weights
+from nerfdiff.render.sampling import edges_between, importance_distances, in_bins, uniform_edges
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What rays saw. `*rays` is the leading shape of the rays.
+
+    Args:
+        rgb: colour over the background.
+        opacity: accumulated weight in [0, 1].
+        depth: expected distance along the ray given that something was hit; `far` where nothing was.
+    """
+
+    rgb: Float[Tensor, "*rays 3"]
+    opacity: Float[Tensor, "*rays"]
+    depth: Float[Tensor, "*rays"]
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """Uniform, then importance samples of one and the same field, composited together.
+
+    Args:
+        uniform_samples, importance_samples: per ray; the paper uses 64 and 64.
+        background: grey level behind everything (1 is white).
+        chunk: points per evaluation of the field at most. Under autograd each chunk is recomputed in the backward
+            pass, so memory is O(chunk) whatever the number of rays and samples.
+    """
+
+    uniform_samples: int
+    importance_samples: int
+    background: float
+    chunk: int
+
+    @property
+    def samples_per_ray(self) -> int:
+        return self.uniform_samples + self.importance_samples
+
+    def render(self, field: FieldFn, rays: Rays, jitter: Float[Tensor, "batch n samples"] | None = None) -> Rendering:
+        """Render rays of leading shape [batch, n] through a batch of fields.
+
+        Args:
+            jitter: uniform in [0, 1), last axis `samples_per_ray`; None is deterministic.
+        """
+        batch, n = rays.near.shape
+        per_chunk = max(1, self.chunk // (batch * self.samples_per_ray))
+        parts = [rays.origins, rays.directions, rays.near, rays.far]
+        if jitter is not None:
+            parts.append(jitter)
+        recompute = torch.is_grad_enabled() and n > per_chunk
+        outputs = []
+        for chunk in zip(*(part.split(per_chunk, dim=1) for part in parts), strict=True):
+            if recompute:
+                # Nothing random happens inside: the jitter is an argument.
+                outputs.append(checkpoint(self._render, field, *chunk, use_reentrant=False, preserve_rng_state=False))
+            else:
+                outputs.append(self._render(field, *chunk))
+        return Rendering(*(torch.cat(values, dim=1) for values in zip(*outputs, strict=True)))
+
+    def render_views(
+        self,
+        field: FieldFn,
+        cameras: Cameras,
+        near: Float[Tensor, "batch"],
+        far: Float[Tensor, "batch"],
+        jitter: Float[Tensor, "batch n samples"] | None = None,
+    ) -> Rendering:
+        """Render whole images of cameras [batch, views], given in the input cameras' space.
+
+        Returns:
+            A rendering of leading shape [batch, views, height, width].
+        """
+        rays = cameras.rays(near[:, None], far[:, None])
+        shape = torch.broadcast_shapes(rays.near.shape, rays.directions.shape[:-1])
+        flat = Rays(
+            rays.origins.flatten(1, 3),
+            rays.directions.flatten(1, 3),
+            rays.near.expand(shape).flatten(1, 3),
+            rays.far.expand(shape).flatten(1, 3),
+        )
+        out = self.render(field, flat, jitter)
+        return Rendering(out.rgb.reshape(*shape, 3), out.opacity.reshape(shape), out.depth.reshape(shape))
+
+    def _render(self, field, origins, directions, near, far, jitter=None):
+        rays = Rays(origins, directions, near, far)
+        uniform_jitter, importance_jitter = (
+            (None, None) if jitter is None else jitter.tensor_split([self.uniform_samples], dim=-1)
+        )
+        edges = uniform_edges(near, far, self.uniform_samples)
+        distances = in_bins(edges, uniform_jitter)
+        rgb, density = self._query(field, rays, distances)
+        if self.importance_samples > 0:
+            with torch.no_grad():
+                lengths = edges_between(distances, near, far).diff(dim=-1)
+                weights = compositing_weights(density, lengths)
+                bins = edges_between(distances, near, far)
+                drawn = importance_distances(bins, weights, self.importance_samples, importance_jitter)
+            rgb_drawn, density_drawn = self._query(field, rays, drawn)
+            distances, order = torch.cat([distances, drawn], -1).sort(-1)
+            rgb = torch.cat([rgb, rgb_drawn], -2).gather(-2, order[..., None].expand(*order.shape, 3))
+            density = torch.cat([density, density_drawn], -1).gather(-1, order)
+        lengths = edges_between(distances, near, far).diff(dim=-1)
+        weights = compositing_weights(density, lengths)
+        opacity = weights.sum(-1)
+        colour = (weights[..., None] * rgb).sum(-2) + (1 - opacity)[..., None] * self.background
+        reached = opacity > 1e-6
+        expected = (weights * distances).sum(-1) / opacity.clamp_min(1e-6)
+        return colour, opacity, torch.where(reached, expected, far)
+
+    @staticmethod
+    def _query(field, rays, distances):
+        points = rays.at(distances)
+        rgb, density = field(points.flatten(1, 2))
+        return rgb.reshape(*points.shape), density.reshape(points.shape[:-1])

@@ -1,0 +1,60 @@
+"""Where to look along a ray: uniform bins, then importance samples from what the bins showed."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfdiff.precision import at_least_single
+
+
+def uniform_edges(near: Float[Tensor, "*rays"], far: Float[Tensor, "*rays"], n: int) -> Float[Tensor, "*rays n+1"]:
+    """Edges of n equal bins between near and far."""
+    steps = torch.linspace(0, 1, n + 1, dtype=near.dtype, device=near.device)
+    return near[..., None] + (far - near)[..., None] * steps
+
+
+def in_bins(edges: Float[Tensor, "*rays n+1"], jitter: Float[Tensor, "*rays n"] | None) -> Float[Tensor, "*rays n"]:
+    """One distance per bin: its centre, or the place `jitter` in [0, 1) picks (stratified sampling)."""
+    offset = 0.5 if jitter is None else jitter
+    return edges[..., :-1] + offset * edges.diff(dim=-1)
+
+
+def importance_distances(
+    edges: Float[Tensor, "*rays n+1"],
+    weights: Float[Tensor, "*rays n"],
+    n: int,
+    jitter: Float[Tensor, "*rays m"] | None,
+    floor: float = 1e-2,
+) -> Float[Tensor, "*rays m"]:
+    """n distances drawn by inverse CDF from the piecewise-constant density `weights` over the bins.
+
+    Args:
+        jitter: in [0, 1), one per drawn distance; None takes the n quantile centres.
+        floor: share of the draws spread evenly over all bins, so that a ray that met nothing (all weights zero)
+            is sampled evenly and no bin is never looked at.
+
+    Returns:
+        Ascending distances. No gradient flows through the choice of samples.
+    """
+    weights = at_least_single(weights.detach())
+    total = weights.sum(-1, keepdim=True)
+    share = torch.where(total > 1e-8, weights / total.clamp_min(1e-8), 1.0 / weights.shape[-1])
+    share = (1 - floor) * share + floor / weights.shape[-1]
+    cdf = torch.cat([torch.zeros_like(total), share.cumsum(-1)], -1)
+    cdf = cdf / cdf[..., -1:]
+    quantile_edges = torch.linspace(0, 1, n + 1, dtype=weights.dtype, device=weights.device)
+    u = in_bins(quantile_edges.expand(*weights.shape[:-1], n + 1), jitter).contiguous()
+    upper = torch.searchsorted(cdf, u, right=True).clamp(1, weights.shape[-1])
+    lower = upper - 1
+    c0, c1 = cdf.gather(-1, lower), cdf.gather(-1, upper)
+    e0, e1 = edges.gather(-1, lower), edges.gather(-1, upper)
+    fraction = ((u - c0) / (c1 - c0).clamp_min(1e-12)).clamp(0, 1)
+    return e0 + fraction * (e1 - e0)
+
+
+def edges_between(
+    distances: Float[Tensor, "*rays n"], near: Float[Tensor, "*rays"], far: Float[Tensor, "*rays"]
+) -> Float[Tensor, "*rays n+1"]:
+    """Intervals that partition [near, far], one around each of these ascending distances."""
+    middle = 0.5 * (distances[..., 1:] + distances[..., :-1])
+    return torch.cat([near[..., None], middle, far[..., None]], -1)

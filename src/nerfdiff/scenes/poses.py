@@ -1,0 +1,56 @@
+"""Cameras of the SRN layout: OpenCV axes, cam2world, in a z-up world, looking at the origin.
+
+numpy in float64, so that workers that render need not load torch.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+# SRN's renders: 131.25 px at 128 × 128 with the principal point in the middle.
+FOCAL_PER_PIXEL = 131.25 / 128
+SPIRAL_VIEWS = 251
+
+
+def look_at_origin(centre: Sequence[float]) -> Float[np.ndarray, "4 4"]:
+    """cam2world of a camera at `centre` that looks at the origin, the world's z pointing up in the image.
+
+    Straight above or below, where up is undefined, x is (−1, 0, 0): the limit SRN's own files hold.
+    """
+    centre = np.asarray(centre, np.float64)
+    z = -centre / np.linalg.norm(centre)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    norm = np.linalg.norm(x)
+    x = x / norm if norm > 1e-9 else np.array([-1.0, 0.0, 0.0])
+    c2w = np.eye(4)
+    c2w[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    c2w[:3, 3] = centre
+    return c2w
+
+
+def srn_spiral(radius: float, views: int = SPIRAL_VIEWS) -> Float[np.ndarray, "views 4 4"]:
+    """The first `views` of the 251 test poses of SRN-ShapeNet, from the equator up to the pole."""
+    k = np.arange(views)
+    elevation, azimuth = np.deg2rad(0.36 * k), 20 - 0.08 * k
+    circle = np.cos(elevation)
+    directions = np.stack([circle * np.cos(azimuth), circle * np.sin(azimuth), np.sin(elevation)], axis=1)
+    return np.stack([look_at_origin(radius * d) for d in directions])
+
+
+def random_sphere(radius: float, views: int, rng: np.random.Generator) -> Float[np.ndarray, "views 4 4"]:
+    """Poses uniform on the whole sphere, below the ground included, as SRN's training views are."""
+    directions = rng.standard_normal((views, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.stack([look_at_origin(radius * d) for d in directions])
+
+
+def intrinsics_text(resolution: int) -> str:
+    """`intrinsics.txt` of SRN: f cx cy, two unused lines, height and width."""
+    focal, centre = FOCAL_PER_PIXEL * resolution, resolution / 2
+    return f"{focal:f} {centre:f} {centre:f} 0.\n0. 0. 0.\n1.\n{resolution} {resolution}\n"
+
+
+def pose_text(c2w: Float[np.ndarray, "4 4"]) -> str:
+    """A pose file: 16 numbers on one line, row by row."""
+    return " ".join(repr(float(v)) for v in np.asarray(c2w, np.float64).ravel())

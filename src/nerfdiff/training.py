@@ -1,0 +1,121 @@
+"""One training run, from a composed config to a model on disk."""
+
+import logging
+import shutil
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.utils import instantiate
+from lightning import Trainer, seed_everything
+from omegaconf import DictConfig, OmegaConf
+
+from nerfdiff.callbacks.checkpoint import ClearCheckpointIO
+from nerfdiff.checkpoint import check_resumable, export_model, find_last
+from nerfdiff.errors import CheckpointError
+from nerfdiff.modules.nerfdiff_module import NerfDiffModule
+
+log = logging.getLogger(__name__)
+
+
+def train(cfg: DictConfig) -> dict[str, float]:
+    """Train, or go on training, the run of `cfg.paths.output_dir`.
+
+    Leaves there `checkpoints/last.ckpt` and `best.ckpt`, `model/` (averaged weights as safetensors with their
+    settings), `previews/` and TensorBoard logs.
+
+    Returns:
+        the last logged metrics.
+
+    Raises:
+        UserError: bad data, config, checkpoint, or a run that diverged; the message says what to do.
+    """
+    # Seeds the initial weights. All other randomness is a function of cfg.seed and the draw (nerfdiff.randomness).
+    seed_everything(cfg.seed, verbose=False)
+    if cfg.threads is not None:
+        torch.set_num_threads(cfg.threads)
+    output_dir = Path(cfg.paths.output_dir)
+    model_config = plain(cfg.model) | {"conditioning": plain(cfg.conditioning)}
+    last = _checkpoint_to_resume(output_dir, cfg.resume, model_config)
+
+    trainer = build_trainer(cfg)
+    module = NerfDiffModule(
+        model=model_config,
+        losses=plain(cfg.losses),
+        optimizer=plain(cfg.optimizer),
+        validation_times=plain(cfg.validation_times),
+        channels_last=cfg.channels_last,
+        seed=cfg.seed,
+    )
+    datamodule = instantiate(cfg.data)
+    if trainer.is_global_zero:
+        output_dir.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(cfg, output_dir / "config.yaml", resolve=True)
+    _announce(module, last)
+
+    trainer.fit(module, datamodule, ckpt_path=last, weights_only=True)
+
+    if trainer.is_global_zero:
+        # With the EMA callback, the module holds the averaged weights once `fit` is over.
+        path = export_model(module.model, model_config, output_dir / "model", torch.float32)
+        log.info("weights: %s", path)
+        log.info("previews: %s   curves: tensorboard --logdir %s", output_dir / "previews", output_dir)
+    return {name: float(value) for name, value in trainer.callback_metrics.items()}
+
+
+def build_trainer(cfg: DictConfig) -> Trainer:
+    """The Lightning Trainer of a composed training config."""
+    options: dict[str, Any] = {}
+    if cfg.trainer.precision == "auto":
+        options["precision"] = auto_precision(cfg.trainer.accelerator)
+    if cfg.logger is not None:
+        options["logger"] = instantiate(cfg.logger)
+    callbacks = [instantiate(callback) for callback in cfg.callbacks.values() if callback is not None]
+    return instantiate(
+        cfg.trainer,
+        callbacks=callbacks,
+        plugins=[ClearCheckpointIO()],
+        # Lightning counts batches where we count optimizer steps.
+        val_check_interval=cfg.validation_every * cfg.trainer.accumulate_grad_batches,
+        check_val_every_n_epoch=None,
+        **options,
+    )
+
+
+def auto_precision(accelerator: str) -> str:
+    """`bf16-mixed` where a GPU will be used that computes in bf16, else `32-true`."""
+    on_gpu = accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available()
+    return "bf16-mixed" if on_gpu and torch.cuda.is_bf16_supported(including_emulation=False) else "32-true"
+
+
+def plain(node: Any) -> Any:
+    """A config node as dicts and lists, interpolations resolved: what a checkpoint can hold."""
+    return OmegaConf.to_container(node, resolve=True)
+
+
+def _checkpoint_to_resume(output_dir: Path, resume: bool, model_config: dict) -> Path | None:
+    last = find_last(output_dir)
+    if last is None:
+        return None
+    if not resume:
+        raise CheckpointError(
+            f"{output_dir} holds the checkpoint of an earlier run and resume=false: choose another run_name, or "
+            "delete that folder"
+        )
+    check_resumable(last, model_config)
+    return last
+
+
+def _announce(module: NerfDiffModule, last: Path | None) -> None:
+    counts = module.model.parameter_count()
+    # fp32 weights, gradients, Adam's two moments and the average.
+    state = 5 * 4 * counts["total"] / 2**30
+    log.info(
+        "%s/%s: %.1fM parameters (encoder %.1fM, CDM %.1fM); weights, gradients, Adam and EMA take %.2f GiB",
+        module.model.name,
+        module.model.conditioning,
+        *(counts[part] / 1e6 for part in ("total", "encoder", "denoiser")),
+        state,
+    )
+    log.info("disk free: %.1f GiB", shutil.disk_usage(".").free / 2**30)
+    log.info("resuming from %s", last) if last else log.info("starting afresh")

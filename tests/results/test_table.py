@@ -1,0 +1,44 @@
+import io
+
+from rich.console import Console
+
+from nerfdiff.results.row import ResultRow
+from nerfdiff.results.table import markdown, rich_table, write_markdown
+
+ROWS = [
+    ResultRow(
+        run_id="1", strategy="none", psnr=23.456, params=22_700_000, render_s={"n": 5, "median": 0.0123, "iqr": 0}
+    ),
+    ResultRow(run_id="2", strategy="mean|image", psnr=9.1),
+]
+
+
+def test_markdown_shows_only_columns_that_have_values():
+    assert markdown(ROWS).splitlines() == [
+        "| strategy | PSNR ↑ | render, s/view | parameters, M |",
+        "| --- | --- | --- | --- |",
+        "| none | 23.46 | 0.0123 | 22.7 |",
+        "| mean\\|image | 9.10 | – | – |",
+    ]
+
+
+def test_failures_are_shown():
+    rows = [*ROWS, ResultRow(run_id="3", strategy="ngd", status="oom")]
+    lines = markdown(rows).splitlines()
+    assert lines[0].endswith("| status |")
+    assert lines[-1] == "| ngd | – | – | – | oom |"
+    assert lines[2].endswith("| ok |")
+
+
+def test_numbers_that_are_not_finite_are_shown():
+    assert "| nan |" in markdown([ResultRow(run_id="1", psnr=float("nan"))])
+
+
+def test_rich_and_markdown_show_the_same(tmp_path):
+    console = Console(file=io.StringIO(), width=120)
+    console.print(rich_table(ROWS, title="Held-out views"))
+    printed = console.file.getvalue()
+    for text in ("Held-out views", "strategy", "PSNR ↑", "23.46", "mean|image", "0.0123"):
+        assert text in printed
+    write_markdown(tmp_path / "table.md", ROWS)
+    assert (tmp_path / "table.md").read_text() == markdown(ROWS)

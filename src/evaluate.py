@@ -3,12 +3,13 @@
 from omegaconf import DictConfig
 
 from nerfdiff.cli import entry_point
-from nerfdiff.evaluation import evaluate
 
 
 @entry_point("evaluate")
 def main(cfg: DictConfig) -> float | None:
     """Returns the strategy's PSNR, which a sweep may optimise."""
+    from nerfdiff.evaluation import evaluate  # slow to import: not for --cfg
+
     return evaluate(cfg)[0].psnr
 
 

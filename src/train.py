@@ -3,12 +3,13 @@
 from omegaconf import DictConfig
 
 from nerfdiff.cli import entry_point
-from nerfdiff.training import train
 
 
 @entry_point("train")
 def main(cfg: DictConfig) -> float | None:
     """Returns the held-out PSNR, which a sweep may optimise."""
+    from nerfdiff.training import train  # slow to import: not for --cfg
+
     return train(cfg).get("val/psnr")
 
 

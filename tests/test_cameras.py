@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from data_fixtures import CX, CY, HEIGHT, POINTS, WIDTH, F, poses, project
 
+from data_fixtures import CX, CY, HEIGHT, POINTS, WIDTH, F, poses, project
 from nerfdiff.cameras import Cameras
 
 

@@ -1,18 +1,20 @@
 """The cache equals its reader, follows the files, and survives other processes, kills and full disks."""
 
-import errno
 import multiprocessing
 import os
 import pickle
+import resource
 import shutil
+import threading
 from collections import namedtuple
 
 import filelock
 import pytest
 import torch
-from data_fixtures import FAR, NEAR, write_scene, write_srn
+from PIL import Image
 from torch.utils.data import DataLoader
 
+from data_fixtures import FAR, NEAR, write_scene, write_srn
 from nerfdiff.data import cache as cache_module
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.cache import CachedReader
@@ -96,9 +98,6 @@ def test_images_of_several_sizes_are_an_error(root):
     write_scene(small / "x", views=2)
     shutil.move(small / "x", root / "data/cars_train/scene9")
     for file in (root / "data/cars_train/scene9/rgb").iterdir():
-        os.unlink(file)
-        from PIL import Image
-
         Image.new("RGB", (28, 20)).save(file)
     with pytest.raises(DataError, match=r"scene9 has images of 20x28, scene scene0 of 40x56; set data\.image_size"):
         cached(root)
@@ -114,14 +113,16 @@ def test_no_room_is_told_before_decoding(root, monkeypatch):
     assert caches(root) == set()
 
 
-def test_a_disk_that_fills_up_leaves_nothing_behind(root, monkeypatch):
-    def full(path, *args):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(cache_module.np, "savez", full)
-    with pytest.raises(DataError, match=r"toy_train-.*No space left on device.*data\.cache_dir"):
-        cached(root)
+def test_a_disk_that_fills_up_leaves_nothing_behind(root):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (64_000, limits[1]))  # the images take 148 kB
+    try:
+        with pytest.raises(DataError, match=r"toy_train-.*cannot be written.*File too large.*data\.cache_dir"):
+            cached(root)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert caches(root) == set()
+    assert len(cached(root)) == 4
 
 
 def test_a_folder_that_cannot_be_written_is_named(root):
@@ -146,22 +147,28 @@ def test_a_shortened_cache_is_refused(root):
         cached(root)
 
 
+def test_a_cache_shortened_while_in_use_is_an_error(root):
+    copy = cached(root)
+    os.truncate(copy.path / "images.u8", 10_000)
+    assert copy.load(0, [0]).pixels.shape[0] == 1
+    with pytest.raises(DataError, match=r"toy_train-.*damaged; delete this folder"):
+        copy.load(0, [1])
+
+
 def test_another_builder_is_waited_for_and_its_cache_used(root, monkeypatch):
     path = cached(root).path
     path.rename(root / "elsewhere")
-    lock = filelock.FileLock(root / "cache" / f"{path.name.rsplit('-', 1)[0]}.lock")
     monkeypatch.setattr(cache_module, "_write", lambda *_: pytest.fail("built twice"))
-    real_acquire = filelock.FileLock.acquire
+    lock = filelock.FileLock(root / "cache" / f"{path.name.rsplit('-', 1)[0]}.lock", thread_local=False)
 
-    def acquire_once_the_other_is_done(self, *args, **kwargs):
-        if lock.is_locked():
-            (root / "elsewhere").rename(path)
-            lock.release()
-        return real_acquire(self, *args, **kwargs)
+    def finish() -> None:
+        (root / "elsewhere").rename(path)
+        lock.release()
 
     lock.acquire()
-    monkeypatch.setattr(filelock.FileLock, "acquire", acquire_once_the_other_is_done)
+    threading.Timer(0.2, finish).start()
     assert len(cached(root)) == 4
+    assert not lock.is_locked
 
 
 def _build_and_digest(root, queue) -> None:
@@ -184,11 +191,11 @@ def test_processes_may_build_at_once(root):
     assert len(caches(root)) == 1
 
 
-def test_pickles_without_its_images(root):
+def test_pickles_without_its_open_file(root):
     copy = cached(root)
     copy.load(0)
     clone = pickle.loads(pickle.dumps(copy))
-    assert clone._pixels is None and copy._pixels is not None
+    assert clone._file is None and copy._file is not None
     assert torch.equal(clone.load(3).pixels, copy.load(3).pixels)
 
 

@@ -72,7 +72,7 @@ def test_damaged_files_are_named(tmp_path, rgb, damage):
     path = tmp_path / "000007.png"
     Image.fromarray(rgb).save(path)
     path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(DataError, match="000007.png") as error:
+    with pytest.raises(DataError, match=r"000007\.png") as error:
         decode(path)
     assert "\n" not in str(error.value)
 

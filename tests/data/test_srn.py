@@ -5,9 +5,9 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from data_fixtures import COLOURS, CX, CY, FAR, HEIGHT, NEAR, POINTS, WIDTH, F, draw, visible, write_scene, write_srn
 from PIL import Image
 
+from data_fixtures import COLOURS, CX, CY, FAR, HEIGHT, NEAR, POINTS, WIDTH, F, draw, visible, write_scene, write_srn
 from nerfdiff.data.scene import MissingSplit
 from nerfdiff.data.srn import SRNReader
 from nerfdiff.errors import DataError

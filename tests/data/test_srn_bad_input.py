@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from data_fixtures import FAR, HEIGHT, NEAR, WIDTH, write_srn
 from PIL import Image
 
+from data_fixtures import FAR, HEIGHT, NEAR, WIDTH, write_srn
 from nerfdiff.data.srn import SRNReader
 from nerfdiff.errors import ConfigError, DataError
 

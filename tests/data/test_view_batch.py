@@ -1,13 +1,10 @@
 """Samples of one scene, and batches of them, against the scene they come from."""
 
-from dataclasses import replace
-
 import pytest
 import torch
-from data_fixtures import FAR, NEAR, write_srn
 
-from nerfdiff.cameras import Cameras
-from nerfdiff.data.batch import ViewBatch
+from data_fixtures import FAR, NEAR, write_srn
+from nerfdiff.data.batch import Sample, ViewBatch
 from nerfdiff.data.draws import Draws
 from nerfdiff.data.srn import SRNReader
 from nerfdiff.data.views import EvaluationScenes, TrainingViews, spread
@@ -22,7 +19,7 @@ def reader(tmp_path) -> SRNReader:
 
 def test_a_sample_is_its_scene_in_the_source_camera(reader):
     scene = reader.load(1, truth=True)
-    batch = ViewBatch.from_scene(scene, source=3, targets=[0, 3], draw=17)
+    batch = ViewBatch.collate([Sample(scene, source=3, targets=[0, 3], draw=17)])
     assert len(batch) == 1 and batch.draws.tolist() == [17]
     assert torch.equal(batch.source[0], scene.images[3])
     assert torch.equal(batch.targets[0], scene.images[[0, 3]])
@@ -40,7 +37,7 @@ def test_a_sample_is_its_scene_in_the_source_camera(reader):
 
 
 def test_collating_joins_samples_in_order(reader):
-    samples = [ViewBatch.from_scene(reader.load(k), k, [0, 4], draw=10 + k) for k in range(3)]
+    samples = [Sample(reader.load(k), k, [0, 4], draw=10 + k) for k in range(3)]
     batch = ViewBatch.collate(samples)
     assert len(batch) == 3 and batch.draws.tolist() == [10, 11, 12]
     assert batch.scene_ids == ("scene0", "scene1", "scene2")
@@ -50,20 +47,21 @@ def test_collating_joins_samples_in_order(reader):
     assert batch.source_cameras.shape == (3,) and batch.target_cameras.shape == (3, 2)
     assert batch.target_depth is None
     for k, sample in enumerate(samples):
-        assert torch.equal(batch.target_pixels[k], sample.target_pixels[0])
-        assert torch.equal(batch.target_cameras.c2w[k], sample.target_cameras.c2w[0])
+        alone = ViewBatch.collate([sample])
+        assert torch.equal(batch.source_pixels[k], alone.source_pixels[0])
+        assert torch.equal(batch.target_pixels[k], alone.target_pixels[0])
+        assert torch.equal(batch.target_cameras.c2w[k], alone.target_cameras.c2w[0])
+        assert torch.equal(batch.source_cameras.K[k], alone.source_cameras.K[0])
 
 
 def test_batches_of_several_image_sizes_are_refused(reader):
-    sample = ViewBatch.from_scene(reader.load(0), 0, [1], draw=0)
-    camera = sample.source_cameras
-    small = replace(sample, source_cameras=Cameras(camera.c2w, camera.K, 20, 28))
+    small = SRNReader(reader.folder.parent, "cars", "train", NEAR, FAR, image_size=[20, 28])
     with pytest.raises(ValueError, match=r"one size.*\(20, 28\), \(40, 56\).*data\.image_size"):
-        ViewBatch.collate([sample, small])
+        ViewBatch.collate([Sample(reader.load(0), 0, [1], 0), Sample(small.load(1), 0, [1], 1)])
 
 
 def test_moving_takes_every_tensor_and_nothing_else(reader):
-    batch = ViewBatch.from_scene(reader.load(0, truth=True), 0, [1, 2], draw=4)
+    batch = ViewBatch.collate([Sample(reader.load(0, truth=True), 0, [1, 2], draw=4)])
     moved = batch.to("meta")
     tensors = [moved.draws, moved.source, moved.targets, moved.near, moved.far, moved.target_depth, moved.target_mask]
     for camera in (moved.source_cameras, moved.target_cameras):
@@ -78,7 +76,7 @@ def test_training_items_are_the_draws(reader):
     dataset = TrainingViews(reader, draws)
     sources_as_targets = 0
     for n in range(20):
-        item = dataset[n]
+        item = ViewBatch.collate([dataset[n]])
         index = draws.scene(n)
         source, targets = draws.views(n, 5)
         scene = reader.load(index)
@@ -101,7 +99,7 @@ def test_evaluation_takes_the_source_by_its_number(tmp_path):
     write_srn(tmp_path, {"test": 2}, views=[10, 64, 65, 70, 99], truth=True)
     dataset = EvaluationScenes(SRNReader(tmp_path, "cars", "test", NEAR, FAR), source_view=64)
     assert len(dataset) == 2
-    item = dataset[1]
+    item = ViewBatch.collate([dataset[1]])
     assert item.scene_ids == ("scene1",) and item.draws.tolist() == [1]
     assert item.source_views == ("000064",)
     assert item.target_views == (("000010", "000065", "000070", "000099"),)
@@ -116,7 +114,8 @@ def test_evaluation_takes_the_source_by_position_where_names_are_words(tmp_path)
         (tmp_path / f"cars_test/scene0/{kind}/000001.{suffix}").rename(
             tmp_path / f"cars_test/scene0/{kind}/front.{suffix}"
         )
-    item = EvaluationScenes(SRNReader(tmp_path, "cars", "test", NEAR, FAR), source_view=2)[0]
+    dataset = EvaluationScenes(SRNReader(tmp_path, "cars", "test", NEAR, FAR), source_view=2)
+    item = ViewBatch.collate([dataset[0]])
     assert item.source_views == ("front",) and item.target_views == (("000000", "000002"),)
 
 
@@ -124,10 +123,10 @@ def test_evaluation_of_part_of_a_split(tmp_path):
     write_srn(tmp_path, {"test": 5}, views=11)
     reader = SRNReader(tmp_path, "cars", "test", NEAR, FAR)
     few = EvaluationScenes(reader, source_view=4, scenes=2, targets=3)
-    assert [few[k].scene_ids[0] for k in range(2)] == ["scene1", "scene3"]
-    assert few[0].target_views == (("000001", "000006", "000009"),)
+    assert [few[k].scene.id for k in range(2)] == ["scene1", "scene3"]
+    assert ViewBatch.collate([few[0]]).target_views == (("000001", "000006", "000009"),)
     strided = EvaluationScenes(reader, source_view=4, stride=3)[0]
-    assert strided.target_views == (("000000", "000003", "000007", "000010"),)
+    assert ViewBatch.collate([strided]).target_views == (("000000", "000003", "000007", "000010"),)
 
 
 def test_a_scene_of_one_view_cannot_be_evaluated(tmp_path):

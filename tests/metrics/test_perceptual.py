@@ -57,13 +57,13 @@ def test_st_lpips_of_blank_images_is_finite(st_lpips):
         assert all(value.isfinite().all() for value in st_lpips(other, white))
 
 
-def test_features_are_the_mean_of_the_deepest_activations(st_lpips):
+def test_features_are_the_mean_of_the_activations_relu4_3(st_lpips):
     a, b = pictures(seed=1), pictures(seed=2)
     _, features_a, features_b = st_lpips(a, b)
     for images, features in ((a, features_a), (b, features_b)):
-        deepest = st_lpips.net.net(st_lpips.net.scaling_layer(2 * images - 1)).relu5_3
+        activations = st_lpips.net.net(st_lpips.net.scaling_layer(2 * images - 1)).relu4_3
         assert features.shape == (2, 512)
-        torch.testing.assert_close(features, deepest.mean(dim=(2, 3)))
+        torch.testing.assert_close(features, activations.mean(dim=(2, 3)))
 
 
 def test_images_too_small_for_the_network_are_enlarged(st_lpips):

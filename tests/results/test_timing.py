@@ -1,5 +1,3 @@
-import time
-
 import pytest
 import torch
 
@@ -13,26 +11,33 @@ def test_summary_is_count_median_and_interquartile_range():
     assert summarise([]) is None
 
 
-def test_warm_up_is_not_counted():
-    calls = []
+@pytest.fixture
+def clock(monkeypatch):
+    """Time that passes only when told to: `clock(seconds)`."""
+    now = [100.0]
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
 
-    def first_call_is_slow():
-        calls.append(None)
-        if len(calls) == 1:
-            time.sleep(0.2)
+    def pass_time(seconds):
+        now[0] += seconds
 
-    timed = time_calls(first_call_is_slow, n=4, warmup=1)
-    assert len(calls) == 5 and timed["n"] == 4 and timed["median"] < 0.1
+    return pass_time
 
 
-def test_stopwatch_measures_what_is_inside_only():
+def test_warm_up_is_not_counted(clock):
+    durations = iter([8.0, 1.0, 2.0, 3.0])
+    timed = time_calls(lambda: clock(next(durations)), n=3, warmup=1)
+    assert timed == {"n": 3, "median": 2.0, "iqr": 1.0}
+    assert next(durations, None) is None
+
+
+def test_stopwatch_measures_what_is_inside_only(clock):
     stopwatch = Stopwatch(warmup=1)
     for _ in range(3):
         with stopwatch.measure():
-            time.sleep(0.01)
-        time.sleep(0.05)
-    assert stopwatch.summary()["n"] == 2
-    assert 0.01 <= stopwatch.summary()["median"] < 0.05
+            clock(1.0)
+        clock(50.0)
+    assert stopwatch.seconds == [1.0, 1.0]
+    assert stopwatch.summary() == {"n": 2, "median": 1.0, "iqr": 0.0}
     assert Stopwatch(warmup=1).summary() is None
 
 

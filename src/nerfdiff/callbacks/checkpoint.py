@@ -45,8 +45,10 @@ class LastCheckpoint(ModelCheckpoint):
                 "Free some space or choose another paths.runs_dir"
             )
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if self._last_global_step_saved != trainer.global_step:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *args: Any, **kwargs: Any) -> None:
+        super().on_train_batch_end(trainer, pl_module, *args, **kwargs)
+        # The last step too; once `fit` ends, the EMA callback has put its average where the raw weights were.
+        if trainer.global_step == trainer.max_steps and self._last_global_step_saved != trainer.global_step:
             self._save_checkpoint(trainer, self.format_checkpoint_name({}))
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:

@@ -11,6 +11,19 @@ from nerfdiff.cameras import Cameras
 from nerfdiff.data.scene import Scene
 
 
+@dataclass(frozen=True)
+class Sample:
+    """What a batch is made of: positions of a source and of target views in a scene.
+
+    `draw` is the sample's number within the run; in evaluation, the scene's within its split.
+    """
+
+    scene: Scene
+    source: int
+    targets: Sequence[int]
+    draw: int
+
+
 @dataclass
 class ViewBatch:
     """B samples: one source view and T target views of one scene each.
@@ -18,8 +31,7 @@ class ViewBatch:
     Images stay 8-bit until they are used, which makes a quarter of the bytes to move to the device.
 
     Args:
-        draws: number of each sample within the run (in evaluation: of the scene within its split); seeds
-            whatever noise the sample needs.
+        draws: each sample's `draw`, which seeds whatever noise the sample needs.
         source_pixels, target_pixels: 8-bit colours on white.
         source_cameras: [B]; `c2w` is the identity.
         target_cameras: [B, T]; relative to the source camera.
@@ -44,51 +56,39 @@ class ViewBatch:
     target_mask: Bool[Tensor, "batch targets height width"] | None = None
 
     @staticmethod
-    def from_scene(scene: Scene, source: int, targets: Sequence[int], draw: int) -> "ViewBatch":
-        """A batch of one sample from positions among the scene's views."""
-        index = torch.as_tensor(targets)
-        source_camera = scene.cameras[source]
-        return ViewBatch(
-            draws=torch.tensor([draw]),
-            source_pixels=scene.pixels[source][None],
-            # exactly the identity, where R·Rᵀ of a pose from a text file only nearly is
-            source_cameras=replace(source_camera, c2w=torch.eye(4)[None], K=source_camera.K[None]),
-            target_pixels=scene.pixels[index][None],
-            target_cameras=scene.cameras[index].relative_to(source_camera)[None],
-            near=torch.tensor([scene.near]),
-            far=torch.tensor([scene.far]),
-            scene_ids=(scene.id,),
-            source_views=(scene.views[source],),
-            target_views=(tuple(scene.views[t] for t in targets),),
-            target_depth=None if scene.depth is None else scene.depth[index][None],
-            target_mask=None if scene.mask is None else scene.mask[index][None],
-        )
-
-    @staticmethod
-    def collate(samples: Sequence["ViewBatch"]) -> "ViewBatch":
-        """Join batches along B.
+    def collate(samples: Sequence[Sample]) -> "ViewBatch":
+        """Batch samples, and put their cameras into the space of their sources.
 
         Raises:
             ValueError: image sizes, or the numbers of targets, differ.
         """
-        joined = {}
-        for field in fields(ViewBatch):
-            values = [getattr(sample, field.name) for sample in samples]
-            if isinstance(values[0], Cameras):
-                sizes = {(camera.height, camera.width) for camera in values}
-                if len(sizes) > 1:
-                    raise ValueError(
-                        f"scenes of a batch need images of one size, not {sorted(sizes)}; set data.image_size"
-                    )
-                c2w, K = (torch.cat([getattr(camera, name) for camera in values]) for name in ("c2w", "K"))
-                joined[field.name] = replace(values[0], c2w=c2w, K=K)
-            elif isinstance(values[0], Tensor):
-                joined[field.name] = torch.cat(values)
-            elif values[0] is None:
-                joined[field.name] = None
-            else:
-                joined[field.name] = tuple(item for value in values for item in value)
-        return ViewBatch(**joined)
+        scenes = [sample.scene for sample in samples]
+        sizes = {tuple(scene.pixels.shape[-2:]) for scene in scenes}
+        if len(sizes) > 1:
+            raise ValueError(f"scenes of a batch need images of one size, not {sorted(sizes)}; set data.image_size")
+        sources = Cameras.stack([sample.scene.cameras[sample.source] for sample in samples])
+        targets = Cameras.stack([sample.scene.cameras[list(sample.targets)] for sample in samples])
+
+        def of_targets(values: Sequence[Tensor | None]) -> Tensor | None:
+            if any(value is None for value in values):
+                return None
+            return torch.stack([value[list(s.targets)] for value, s in zip(values, samples, strict=True)])
+
+        return ViewBatch(
+            draws=torch.tensor([sample.draw for sample in samples]),
+            source_pixels=torch.stack([sample.scene.pixels[sample.source] for sample in samples]),
+            # exactly the identity, where R·Rᵀ of a pose from a text file only nearly is
+            source_cameras=replace(sources, c2w=torch.eye(4).repeat(len(samples), 1, 1)),
+            target_pixels=of_targets([scene.pixels for scene in scenes]),
+            target_cameras=targets.relative_to(sources[:, None]),
+            near=torch.tensor([scene.near for scene in scenes]),
+            far=torch.tensor([scene.far for scene in scenes]),
+            scene_ids=tuple(scene.id for scene in scenes),
+            source_views=tuple(sample.scene.views[sample.source] for sample in samples),
+            target_views=tuple(tuple(s.scene.views[t] for t in s.targets) for s in samples),
+            target_depth=of_targets([scene.depth for scene in scenes]),
+            target_mask=of_targets([scene.mask for scene in scenes]),
+        )
 
     def __len__(self) -> int:
         return self.draws.shape[0]

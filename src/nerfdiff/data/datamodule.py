@@ -41,7 +41,7 @@ class SceneDataModule(LightningDataModule):
         eval_scenes: how many scenes the test looks at (None: all).
         eval_stride: the test takes every `eval_stride`-th of a scene's other views as a target.
         num_workers: processes that load training and test batches.
-        cache, cache_dir: whether decoded training images are kept in a memory-mapped file, and where.
+        cache, cache_dir: whether training images are decoded once into one file, and where.
         seed: of the draws.
         train_split, val_split, test_split: names of the dataset's splits. Where the one for validation is
             not there, training goes on without validation.
@@ -120,6 +120,8 @@ class SceneDataModule(LightningDataModule):
                 self.val_set = self._validation_scenes()
             except MissingSplit as error:
                 self.val_set = None
+                if self.trainer is not None:
+                    self.trainer.limit_val_batches = 0  # Lightning's way of having no validation
                 if self.trainer is None or self.trainer.is_global_zero:
                     log.warning("training without validation: %s (data.val_split names another split)", error)
         elif stage == "validate":

@@ -2,14 +2,14 @@
 
 from torch.utils.data import Dataset
 
-from nerfdiff.data.batch import ViewBatch
+from nerfdiff.data.batch import Sample
 from nerfdiff.data.draws import Draws
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.errors import DataError
 
 
-class TrainingViews(Dataset[ViewBatch]):
-    """Item n is draw n of the run, as a batch of one; any n ≥ 0 is valid.
+class TrainingViews(Dataset[Sample]):
+    """Item n is draw n of the run; any n ≥ 0 is valid.
 
     Raises:
         DataError: a scene has too few views, or its files are damaged.
@@ -18,7 +18,7 @@ class TrainingViews(Dataset[ViewBatch]):
     def __init__(self, reader: SceneReader, draws: Draws):
         self.reader, self.draws = reader, draws
 
-    def __getitem__(self, draw: int) -> ViewBatch:
+    def __getitem__(self, draw: int) -> Sample:
         index = self.draws.scene(draw)
         count = len(self.reader.view_names(index))
         if count <= self.draws.target_views:
@@ -29,11 +29,11 @@ class TrainingViews(Dataset[ViewBatch]):
         source, targets = self.draws.views(draw, count)
         wanted = sorted({source, *targets})
         scene = self.reader.load(index, wanted)
-        return ViewBatch.from_scene(scene, wanted.index(source), [wanted.index(t) for t in targets], draw)
+        return Sample(scene, wanted.index(source), [wanted.index(t) for t in targets], draw)
 
 
-class EvaluationScenes(Dataset[ViewBatch]):
-    """Item i is one scene as a batch of one: the given source view, and other views as targets, with truth.
+class EvaluationScenes(Dataset[Sample]):
+    """Item i is one scene: the given source view, and other views as targets, with ground truth.
 
     Args:
         reader: the split to evaluate.
@@ -64,7 +64,7 @@ class EvaluationScenes(Dataset[ViewBatch]):
     def __len__(self) -> int:
         return len(self.indices)
 
-    def __getitem__(self, item: int) -> ViewBatch:
+    def __getitem__(self, item: int) -> Sample:
         index, source = self.indices[item], self.sources[item]
         names = self.reader.view_names(index)
         others = [view for view in range(len(names)) if view != source][:: self.stride]
@@ -72,7 +72,7 @@ class EvaluationScenes(Dataset[ViewBatch]):
             raise DataError(f"scene {self.reader.scene_id(index)} has no view beside its source {names[source]}")
         targets = [others[position] for position in spread(len(others), self.targets)]
         scene = self.reader.load(index, [source, *targets], truth=True)
-        return ViewBatch.from_scene(scene, 0, range(1, len(targets) + 1), index)
+        return Sample(scene, 0, range(1, len(targets) + 1), index)
 
     def _source(self, index: int) -> int:
         names = self.reader.view_names(index)

@@ -82,11 +82,11 @@ class STLPIPS:
         net.load_state_dict(weights, assign=True)
         self.net = net.requires_grad_(False).eval().to(device)
         self.device, self.min_size = torch.device(device), min_size
-        self._deepest: list[Tensor] = []
-        self.net.net.slice5.register_forward_hook(self._keep)
+        self._features: list[Tensor] = []
+        self.net.net.slice4.register_forward_hook(self._keep)
 
     def _keep(self, module: nn.Module, inputs: tuple[Tensor], output: Tensor) -> None:
-        self._deepest.append(output.mean(dim=(2, 3)))
+        self._features.append(output.mean(dim=(2, 3)))
 
     @torch.no_grad()
     def __call__(
@@ -96,12 +96,13 @@ class STLPIPS:
 
         Returns:
             the distance of each pair, and the features of predictions and of truth for a Fréchet distance:
-            the deepest activations (relu5_3, 512 channels, not normalised), averaged over the image. All on
-            the CPU.
+            the activations relu4_3 (512 channels, an eighth of the image's resolution, not normalised), averaged
+            over the image. All on the CPU. The next and last layer's activations are 25 times larger and tell a
+            slightly blurred set from a sharp one less well.
         """
         pair = (at_least(x.float().to(self.device), self.min_size) for x in (predictions, truth))
-        self._deepest.clear()
+        self._features.clear()
         distance = self.net(*pair, normalize=True).flatten().cpu()
-        first, second = (features.cpu() for features in self._deepest)
-        self._deepest.clear()
+        first, second = (features.cpu() for features in self._features)
+        self._features.clear()
         return distance, first, second

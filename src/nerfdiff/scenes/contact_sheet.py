@@ -14,11 +14,21 @@ def contact_sheet(folders: Sequence[Path], scenes: int, views: int) -> UInt8[np.
     rows = []
     for folder in _spread(folders, scenes):
         images = sorted((folder / "rgb").glob("*.png"))
-        row = [np.asarray(Image.open(path).convert("RGB")) for path in _spread(images, views)]
-        rows.append(np.concatenate(row, axis=1))
-    width = max(row.shape[1] for row in rows)
-    rows = [np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0)), constant_values=255) for r in rows]
-    return np.concatenate(rows)
+        rows.append([np.asarray(Image.open(path).convert("RGB")) for path in _spread(images, views)])
+    low, high = _occupied([image for row in rows for image in row])
+    strips = [np.concatenate([image[low:high, low:high] for image in row], axis=1) for row in rows]
+    width = max(strip.shape[1] for strip in strips)
+    strips = [np.pad(s, ((0, 0), (0, width - s.shape[1]), (0, 0)), constant_values=255) for s in strips]
+    return np.concatenate(strips)
+
+
+def _occupied(images: Sequence[UInt8[np.ndarray, "size size 3"]]) -> tuple[int, int]:
+    """The central square outside which every image is white, as a range of rows and columns."""
+    size = images[0].shape[0]
+    drawn = np.any([(image < 255).any(axis=-1) for image in images], axis=0)
+    filled = np.flatnonzero(drawn.any(axis=0) | drawn.any(axis=1))
+    margin = max(0, min(filled.min(), size - 1 - filled.max()) - 1) if filled.size else 0
+    return margin, size - margin
 
 
 def write_contact_sheet(root: Path, folders: Sequence[Path], scenes: int, views: int) -> Path | None:

@@ -1,0 +1,75 @@
+import pytest
+import torch
+
+from model_fixtures import config, input_cameras, look_at, model
+from nerfdiff.cameras import Cameras
+from nerfdiff.errors import ConfigError
+
+VARIANTS = {
+    "rendered": {"image": "rendered", "ray_maps": False, "cross_attention": True},
+    "concat": {"image": "source", "ray_maps": True, "cross_attention": False},
+    "cross_attention": {"image": "none", "ray_maps": True, "cross_attention": True},
+}
+
+
+def build(variant: str):
+    net = model(conditioning={"name": variant, **VARIANTS[variant]})
+    for parameter in net.denoiser.parameters():
+        if parameter.abs().sum() == 0:
+            torch.nn.init.normal_(parameter, std=0.1)
+    return net
+
+
+def views() -> Cameras:
+    source = input_cameras(1)
+    c2w = torch.stack([torch.eye(4), look_at((0.9, -0.4, 0.7))])[None]
+    return Cameras(c2w, source.K[None].expand(1, 2, 3, 3), 16, 16)
+
+
+def condition_of(net, source):
+    bounds = torch.tensor([0.8]), torch.tensor([1.8])
+    encoding = net.encode(source, input_cameras(1), *bounds)
+    return net.condition(encoding, views(), net.render(encoding, views()))
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_every_variant_sees_the_input_image_and_the_wanted_view(variant):
+    net, noise = build(variant), torch.Generator().manual_seed(0)
+    source, other = torch.rand(2, 1, 3, 16, 16, generator=noise)
+    z = torch.randn(1, 3, 16, 16, generator=noise).expand(2, -1, -1, -1)
+    x0 = net.denoise(z, torch.tensor(0.5), condition_of(net, source))
+    assert not torch.allclose(x0[0], x0[1], atol=1e-5), "two views, one noise: only the camera differs"
+    changed = net.denoise(z, torch.tensor(0.5), condition_of(net, other))
+    assert not torch.allclose(x0, changed, atol=1e-5)
+
+
+def test_a_denoised_image_is_alpha_z_minus_sigma_v():
+    net = build("rendered")
+    condition = condition_of(net, torch.rand(1, 3, 16, 16))
+    z, t = torch.randn(2, 3, 16, 16), torch.tensor([0.5, 1.0])
+    v = net.denoiser.velocity(z, t, condition)
+    x0 = net.denoise(z, t, condition)
+    torch.testing.assert_close(x0[0], 0.5**0.5 * (z[0] - v[0]))
+    torch.testing.assert_close(x0[1], -v[1])
+
+
+def test_the_denoising_loss_flows_back_through_the_rendering():
+    net = build("rendered")
+    condition = condition_of(net, torch.rand(1, 3, 16, 16))
+    net.denoiser.velocity(torch.randn(2, 3, 16, 16), torch.rand(2), condition).square().sum().backward()
+    assert net.decoder.hidden.weight.grad.abs().sum() > 0
+    assert net.encoder.unet.conv_in.weight.grad.abs().sum() > 0
+
+
+def test_a_cdm_that_cannot_know_the_view_is_refused():
+    with pytest.raises(ConfigError, match="ray_maps=true"):
+        model(conditioning={"image": "source", "ray_maps": False})
+
+
+def test_unknown_images_are_refused_with_the_known_ones():
+    with pytest.raises(ConfigError, match="rendered, source, none"):
+        model(conditioning={"image": "depth"})
+
+
+def test_the_fixture_is_the_rendered_variant():
+    assert {k: v for k, v in config()["conditioning"].items() if k != "name"} == VARIANTS["rendered"]

@@ -1,0 +1,190 @@
+import os
+import re
+import resource
+import signal
+import subprocess
+import time
+
+import pytest
+import torch
+from lightning import Callback
+from training_fixtures import (
+    assert_same_state,
+    command,
+    environment,
+    last_checkpoint,
+    run_command,
+    run_training,
+    write_dataset,
+)
+
+from nerfdiff import training
+from nerfdiff.checkpoint import load_model
+from nerfdiff.errors import CheckpointError, DataError
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return write_dataset(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture(scope="module")
+def whole(data, tmp_path_factory):
+    """An uninterrupted run."""
+    run = tmp_path_factory.mktemp("whole")
+    return run, run_training(data, run)
+
+
+class StopAt(Callback):
+    """Sends this process SIGTERM at the end of a batch, as a scheduler would."""
+
+    def __init__(self, batch: int):
+        self.batch = batch
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        if batch_idx == self.batch:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+
+def train_with(monkeypatch, callback, data, run, *more):
+    """One run with one more callback, before the checkpoints'."""
+    build = training.instantiate
+
+    def instantiate(config, **options):
+        if "callbacks" in options:
+            options["callbacks"] = [callback, *options["callbacks"]]
+        return build(config, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "instantiate", instantiate)
+        return run_training(data, run, *more)
+
+
+def test_a_run_leaves_what_a_person_looks_for(whole):
+    run, metrics = whole
+    assert (run / "config.yaml").is_file()
+    assert (run / "checkpoints" / "last.ckpt").is_file() and (run / "checkpoints" / "best.ckpt").is_file()
+    assert sorted(p.name for p in (run / "previews").iterdir()) == ["step_0000003.png", "step_0000006.png"]
+    assert any((run / "tensorboard").glob("events.*"))
+    assert {"val/psnr", "val/loss_dm", "train/loss_ic", "train/loss_dm", "train/grad_norm"} <= metrics.keys()
+
+
+def test_training_lowers_the_loss(data, tmp_path):
+    short = run_training(data, tmp_path / "a", "trainer.max_steps=3", "optimizer.lr=0.003")
+    longer = run_training(data, tmp_path / "b", "trainer.max_steps=40", "validation_every=40", "optimizer.lr=0.003")
+    assert longer["val/psnr"] > short["val/psnr"] + 2
+    assert longer["val/loss_dm"] < 0.9 * short["val/loss_dm"]
+
+
+@pytest.mark.parametrize(("accumulate", "batch"), [(1, 2), (2, 4), (2, 5)])
+def test_sigterm_then_the_same_command_ends_as_if_nothing_happened(data, tmp_path, monkeypatch, accumulate, batch):
+    """Stopped between steps (batch 5 of windows of two) and within one (batch 4)."""
+    more = f"trainer.accumulate_grad_batches={accumulate}"
+    run_training(data, tmp_path / "whole", more)
+    with pytest.raises(SystemExit):
+        train_with(monkeypatch, StopAt(batch), data, tmp_path / "stopped", more)
+    step = last_checkpoint(tmp_path / "stopped")["global_step"]
+    assert step == (batch + 1) // accumulate
+    run_training(data, tmp_path / "stopped", more)
+    assert_same_state(last_checkpoint(tmp_path / "whole"), last_checkpoint(tmp_path / "stopped"))
+
+
+def test_kill_9_then_the_same_command_ends_as_if_nothing_happened(data, tmp_path):
+    steps = ["trainer.max_steps=30", "validation_every=1000", "callbacks.last.every_n_steps=1"]
+    last = tmp_path / "killed" / "checkpoints" / "last.ckpt"
+    process = subprocess.Popen(command(data, tmp_path / "killed", *steps), env=environment())
+    deadline = time.monotonic() + 120
+    while not last.is_file() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.kill()
+    process.wait()
+    assert 0 < last_checkpoint(tmp_path / "killed")["global_step"] < 30
+    run_command(data, tmp_path / "killed", *steps)
+    run_training(data, tmp_path / "whole", *steps)
+    assert_same_state(last_checkpoint(tmp_path / "whole"), last_checkpoint(tmp_path / "killed"))
+
+
+def test_a_finished_run_can_be_prolonged(data, tmp_path):
+    constant = ("optimizer.decay=none",)
+    run_training(data, tmp_path / "grown", "trainer.max_steps=3", *constant)
+    run_training(data, tmp_path / "grown", "trainer.max_steps=6", *constant)
+    run_training(data, tmp_path / "whole", "trainer.max_steps=6", *constant)
+    assert_same_state(last_checkpoint(tmp_path / "whole"), last_checkpoint(tmp_path / "grown"))
+
+
+def test_accumulated_batches_give_the_gradients_of_one(data, tmp_path, whole):
+    run_training(data, tmp_path, "trainer.accumulate_grad_batches=2")
+    one, two = last_checkpoint(whole[0])["current_model_state"], last_checkpoint(tmp_path)["current_model_state"]
+    for name, value in one.items():
+        torch.testing.assert_close(two[name], value, atol=2e-4, rtol=1e-3)
+
+
+def test_two_processes_train_what_one_does(data, tmp_path, whole):
+    more = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "trainer.precision=32-true"]
+    run_command(data, tmp_path, *more)
+    one, two = last_checkpoint(whole[0]), last_checkpoint(tmp_path)
+    assert two["global_step"] == one["global_step"]
+    for name, value in one["current_model_state"].items():
+        torch.testing.assert_close(two["current_model_state"][name], value, atol=2e-4, rtol=1e-3)
+
+
+def test_exported_and_checkpointed_averages_agree(whole):
+    run, _ = whole
+    from_run = load_model(run, "ema", run).model.state_dict()
+    exported = load_model(run / "model", "ema", run).model.state_dict()
+    raw = load_model(run, "raw", run).model.state_dict()
+    assert all(torch.equal(from_run[name], exported[name]) for name in from_run)
+    assert any(not torch.equal(from_run[name], raw[name]) for name in from_run)
+
+
+def test_resuming_with_another_model_is_refused_by_name(data, whole):
+    with pytest.raises(CheckpointError, match=re.escape("model.field.channels: 4 → 6")):
+        run_training(data, whole[0], "model.field.channels=6")
+
+
+def test_a_folder_with_a_checkpoint_is_not_overwritten(data, whole):
+    with pytest.raises(CheckpointError, match="resume=false"):
+        run_training(data, whole[0], "resume=false")
+
+
+def test_a_damaged_checkpoint_is_named(data, tmp_path):
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "last.ckpt").write_bytes(b"PK\x03\x04 torn")
+    with pytest.raises(CheckpointError, match=r"last\.ckpt is not a readable checkpoint"):
+        run_training(data, tmp_path)
+
+
+def test_a_full_disk_costs_no_earlier_checkpoint(data, tmp_path):
+    run_training(data, tmp_path, "trainer.max_steps=2")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))  # what the file system answers when it is full
+    try:
+        with pytest.raises(CheckpointError, match=r"cannot write .*last\.ckpt"):
+            run_training(data, tmp_path, "trainer.max_steps=4", "validation_every=1000")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert last_checkpoint(tmp_path)["global_step"] == 2
+    run_training(data, tmp_path, "trainer.max_steps=4")
+    assert last_checkpoint(tmp_path)["global_step"] == 4
+
+
+def test_training_goes_on_without_a_validation_split(data, tmp_path):
+    root = tmp_path / "data"
+    root.mkdir()
+    (root / "cars_train").symlink_to(data / "cars_train")
+    metrics = run_training(root, tmp_path / "run")
+    assert "val/psnr" not in metrics and last_checkpoint(tmp_path / "run")["global_step"] == 6
+
+
+def test_a_missing_root_is_named(tmp_path):
+    with pytest.raises(DataError, match="nowhere"):
+        run_training(tmp_path / "nowhere", tmp_path / "run")
+
+
+def test_the_command_prints_one_line_for_an_error(tmp_path):
+    done = subprocess.run(
+        command(tmp_path / "nowhere", tmp_path / "run"), capture_output=True, text=True, env=environment()
+    )
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert done.stderr.strip().splitlines()[-1].startswith("error: ")

@@ -138,7 +138,7 @@ def print_table(arguments: argparse.Namespace, results: list[tuple[str, list[flo
         f"CPU: {cpu_name()}, {os.cpu_count()} cores; GPU: {device}; torch {torch.__version__}"
     )
     for column in ("", "images/s (median)", "quartiles", "ms/image"):
-        table.add_column(column, justify="left" if not column else "right")
+        table.add_column(column, justify="right" if column else "left", no_wrap=True)
     for name, rates in results:
         low, median, high = statistics.quantiles(rates, n=4) if len(rates) > 1 else rates * 3
         table.add_row(name, f"{median:,.0f}", f"{low:,.0f} to {high:,.0f}", f"{1000 / median:.3f}")

@@ -70,7 +70,7 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
     try:
         overrides = OverridesParser.create().parse_overrides(words)
     except HydraException as error:
-        raise ConfigError(str(error).splitlines()[0]) from error
+        raise ConfigError(f"cannot read the overrides {' '.join(words)}: {str(error).splitlines()[0]}") from error
     groups = [o for o in overrides if _is_group(o)]
     base = _compose(config_name, [_first_choice(o) for o in groups], with_hydra=True)
     for override in overrides:
@@ -101,7 +101,7 @@ def _first_choice(override: Override) -> str:
 def _check_value(config: DictConfig, override: Override) -> None:
     node, seen = config, []
     for part in override.key_or_group.split("."):
-        if not isinstance(node, DictConfig) or part not in node:
+        if not isinstance(node, DictConfig) or part not in list(node):  # `in` overlooks mandatory values
             where = ".".join(seen)
             keys = sorted(map(str, node)) if isinstance(node, DictConfig) else []
             if not seen:

@@ -147,7 +147,7 @@ def test_intrinsics_may_be_given_per_view(tmp_path):
     assert torch.equal(half, torch.tensor([[(F + 4) / 2, 0, CX / 2], [0, F / 2, CY / 2], [0, 0, 1]]))
 
 
-@pytest.mark.parametrize("size", [(20, 28), (80, 112), (30, 42)])
+@pytest.mark.parametrize("size", [(20, 28), (80, 112), (30, 42), (20, 56), (40, 84)])
 def test_resized_images_keep_points_at_their_projections(tmp_path, size):
     write_srn(tmp_path, radius=3)
     scene = read(tmp_path, image_size=size).load(0)

@@ -52,7 +52,8 @@ class LastCheckpoint(ModelCheckpoint):
             self._save_checkpoint(trainer, self.format_checkpoint_name({}))
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        stopped = isinstance(exception, SIGTERMException | KeyboardInterrupt)
+        # A SIGTERM to the whole process group kills the loader's workers first, which raises something else.
+        stopped = isinstance(exception, SIGTERMException | KeyboardInterrupt) or trainer.received_sigterm
         batches = trainer.fit_loop.epoch_loop.batch_progress.current
         between_steps = batches.ready == batches.processed and batches.ready % trainer.accumulate_grad_batches == 0
         unsaved = self._last_global_step_saved != trainer.global_step > 0

@@ -1,0 +1,66 @@
+import math
+
+import pytest
+import torch
+from lightning import LightningModule, Trainer
+from torch.utils.data import DataLoader
+
+from nerfdiff.callbacks.nonfinite import NonFiniteGuard
+from nerfdiff.errors import TrainingDiverged
+
+
+class Sometimes(LightningModule):
+    """Its loss is not finite at chosen steps."""
+
+    def __init__(self, bad: dict[int, float]):
+        super().__init__()
+        self.layer, self.bad, self.history = torch.nn.Linear(1, 1), bad, []
+
+    def training_step(self, batch, batch_idx):
+        self.history.append(self.layer.weight.item())
+        return self.layer(batch).square().mean() * self.bad.get(batch_idx, 1.0)
+
+    def configure_optimizers(self):
+        return torch.optim.AdamW(self.parameters(), lr=0.1)
+
+
+def fit(module, guard):
+    options = {"logger": False, "enable_progress_bar": False, "enable_checkpointing": False}
+    run = Trainer(accelerator="cpu", max_epochs=1, enable_model_summary=False, callbacks=[guard], **options)
+    run.fit(module, DataLoader(torch.ones(8, 1), batch_size=1))
+    return run
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_bad_step_changes_nothing_and_is_counted(value):
+    module, guard = Sometimes({2: value, 5: value}), NonFiniteGuard(patience=2)
+    with pytest.warns(UserWarning, match="non-finite gradients at step 2"):
+        run = fit(module, guard)
+    assert guard.total == 2
+    assert run.callback_metrics["train/nonfinite_steps"] == 2
+    weights = module.history
+    assert weights[3] == weights[2] and weights[6] == weights[5]
+    assert weights[4] != weights[3] and math.isfinite(weights[7])
+
+
+def test_bad_steps_in_a_row_stop_the_run():
+    module, guard = Sometimes({3: math.nan, 4: math.nan, 5: math.nan}), NonFiniteGuard(patience=3)
+    with pytest.raises(TrainingDiverged, match="3 steps in a row"):
+        fit(module, guard)
+    assert len(module.history) == 6
+
+
+def test_the_count_survives_a_resume():
+    guard = NonFiniteGuard(patience=5)
+    guard.total, guard.in_a_row = 7, 2
+    again = NonFiniteGuard(patience=5)
+    again.load_state_dict(guard.state_dict())
+    assert (again.total, again.in_a_row) == (7, 2)
+
+
+def test_the_gradient_norm_is_that_of_all_parameters_together():
+    module, guard = Sometimes({}), NonFiniteGuard(patience=5)
+    run = fit(module, guard)
+    gradients = [p.grad for p in module.parameters()]
+    expected = math.sqrt(sum(float(g.square().sum()) for g in gradients))
+    assert float(run.callback_metrics["train/grad_norm"]) == pytest.approx(expected, rel=1e-5)

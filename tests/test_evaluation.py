@@ -1,0 +1,180 @@
+import json
+
+import pytest
+import torch
+from training_fixtures import run_training, write_dataset
+
+from nerfdiff.checkpoint import load_model
+from nerfdiff.cli import load_config
+from nerfdiff.distill.none import SingleImageNeRF
+from nerfdiff.errors import CheckpointError, DataError
+from nerfdiff.evaluation import evaluate
+from nerfdiff.metrics.predictions import NonFinitePrediction
+from nerfdiff.results.row import read_rows
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return write_dataset(tmp_path_factory.mktemp("data"), scenes=2)
+
+
+@pytest.fixture(scope="module")
+def run(data, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    run_training(data, folder, "trainer.max_steps=2")
+    return folder
+
+
+def config(data, run, out, *more):
+    overrides = [
+        f"ckpt={run}",
+        f"data.root={data}",
+        "data.cache=false",
+        "data.image_size=[20,28]",
+        "data.source_view=0",
+        "data.num_workers=0",
+        "orbit.frames=4",
+        "timing.repeats=2",
+        "timing.warmup=1",
+        f"paths.output_dir={out}",
+        "threads=1",
+        *more,
+    ]
+    return load_config("evaluate", overrides)
+
+
+@pytest.mark.parametrize("strategy", [["strategy=none"], ["strategy=cdm", "strategy.steps=3"]])
+def test_an_evaluation_leaves_rows_scores_and_pictures(data, run, tmp_path, strategy):
+    rows = evaluate(config(data, run, tmp_path, *strategy))
+    name = rows[0].strategy
+    assert [row.strategy for row in rows] == [name, "copy_input", "mean_image"]
+    assert [row.strategy for row in read_rows(tmp_path / "results.jsonl")] == [row.strategy for row in rows]
+    for row in rows:
+        assert row.status == "ok" and row.n_scenes == 2 and row.n_views == 2 * 4
+        assert 0 < row.psnr < 60 and row.ssim_impl == "skimage-uniform7" and row.st_lpips_vgg > 0
+        assert (tmp_path / "scores" / row.strategy / "per_image.csv").is_file()
+        assert (tmp_path / "scores" / row.strategy / "per_scene.csv").is_file()
+    assert (tmp_path / f"sheet_{name}.png").stat().st_size > 1000
+    assert (tmp_path / f"orbit_{name}.mp4").stat().st_size > 500
+    assert name in (tmp_path / f"table_{name}.md").read_text()
+
+
+def test_costs_are_counted(data, run, tmp_path):
+    none = evaluate(config(data, run, tmp_path, "baselines=false"))[0]
+    cdm = evaluate(config(data, run, tmp_path, "baselines=false", "strategy=cdm", "strategy.steps=3"))[0]
+    pixels = 8 * 20 * 28
+    assert none.field_queries == cdm.field_queries == pixels * 8  # 4 + 4 samples per ray
+    assert (none.denoiser_calls, cdm.denoiser_calls) == (0, 8 * 3)
+    assert none.distill_s is None and cdm.distill_s["n"] == 1
+    assert none.encode_s["n"] == none.render_s["n"] == 2
+    assert none.depth_rmse is not None and none.mask_iou is not None
+    assert none.params == cdm.params > 100_000
+
+
+def test_copying_the_input_scores_what_the_files_say(data, run, tmp_path):
+    """PSNR of the baseline, computed from the PNG files alone."""
+    import numpy as np
+    from PIL import Image
+
+    rows = evaluate(config(data, run, tmp_path, "data.image_size=null"))
+    scenes = []
+    for scene in sorted((data / "cars_test").iterdir()):
+        views = [np.asarray(Image.open(p), float) / 255 for p in sorted((scene / "rgb").iterdir())]
+        scenes.append(np.mean([-10 * np.log10(np.mean((view - views[0]) ** 2) + 1e-6) for view in views[1:]]))
+    assert rows[1].psnr == pytest.approx(np.mean(scenes), abs=1e-4)
+
+
+def test_the_same_evaluation_predicts_nothing_twice(data, run, tmp_path, monkeypatch):
+    first = evaluate(config(data, run, tmp_path))
+
+    def never(*arguments):
+        raise AssertionError("predicted again")
+
+    video = config(data, run, tmp_path, "orbit.scenes=0")
+    monkeypatch.setattr(SingleImageNeRF, "predict", never)
+    again = evaluate(video)
+    assert [row.psnr for row in again] == [row.psnr for row in first]
+
+
+def test_a_killed_evaluation_goes_on_at_the_next_scene(data, run, tmp_path, monkeypatch):
+    predict, calls = SingleImageNeRF.predict, []
+
+    def fail_at_the_second(self, model, scene, seed):
+        calls.append(scene.scene_ids[0])
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return predict(self, model, scene, seed)
+
+    monkeypatch.setattr(SingleImageNeRF, "predict", fail_at_the_second)
+    settings = config(data, run, tmp_path, "orbit.scenes=0")
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(settings)
+    rows = evaluate(settings)
+    assert calls == ["scene0", "scene1", "scene1"]
+    assert rows[0].n_scenes == 2
+
+
+def test_a_failure_is_a_row(data, run, tmp_path, monkeypatch):
+    predict = SingleImageNeRF.predict
+
+    def broken(self, model, scene, seed):
+        views = predict(self, model, scene, seed)
+        views.images[0, 0, 0, 0] = float("nan")
+        return views
+
+    monkeypatch.setattr(SingleImageNeRF, "predict", broken)
+    with pytest.raises(NonFinitePrediction):
+        evaluate(config(data, run, tmp_path))
+    row = read_rows(tmp_path / "results.jsonl")[-1]
+    assert row.status == "nan" and "not finite" in row.error and row.psnr is None
+
+
+def test_an_all_white_scene_is_finite_and_reported(data, run, tmp_path):
+    import shutil
+
+    from PIL import Image
+
+    shutil.copytree(data, tmp_path / "data", ignore=shutil.ignore_patterns("cache"))
+    white = sorted((tmp_path / "data" / "cars_test").iterdir())[0]
+    for path in (white / "rgb").iterdir():
+        Image.new("RGB", Image.open(path).size, "white").save(path)
+    rows = evaluate(config(tmp_path / "data", run, tmp_path / "out"))
+    copy = rows[1]
+    assert copy.blank_scenes == 1
+    assert copy.psnr == pytest.approx((60 + copy.psnr_without_blank) / 2, abs=1e-3)
+    assert all(torch.isfinite(torch.tensor([row.psnr, row.ssim, row.st_lpips_vgg])).all() for row in rows)
+
+
+def test_missing_checkpoints_and_data_are_named(data, run, tmp_path):
+    with pytest.raises(CheckpointError, match="ckpt=nothing is neither"):
+        evaluate(config(data, "nothing", tmp_path))
+    with pytest.raises(DataError, match="nowhere"):
+        evaluate(config(tmp_path / "nowhere", run, tmp_path))
+
+
+def test_files_that_are_no_checkpoints_are_refused(tmp_path):
+    for name, content in {"a.ckpt": b"nonsense", "b.safetensors": b"\0" * 64}.items():
+        (tmp_path / name).write_bytes(content)
+        (tmp_path / "model.yaml").write_text("{}")
+        with pytest.raises(CheckpointError, match=name):
+            load_model(tmp_path / name, "ema", tmp_path)
+    torch.save({"state_dict": {}}, tmp_path / "c.ckpt")
+    with pytest.raises(CheckpointError, match="holds no model settings"):
+        load_model(tmp_path / "c.ckpt", "ema", tmp_path)
+
+
+def test_a_checkpoint_never_runs_code(tmp_path):
+    class Evil:
+        def __reduce__(self):
+            return (open, (str(tmp_path / "written"), "w"))
+
+    torch.save({"state_dict": Evil()}, tmp_path / "evil.ckpt")
+    with pytest.raises(CheckpointError, match=r"evil\.ckpt"):
+        load_model(tmp_path / "evil.ckpt", "ema", tmp_path)
+    assert not (tmp_path / "written").exists()
+
+
+def test_predictions_name_their_source_view(data, run, tmp_path):
+    evaluate(config(data, run, tmp_path, "baselines=false"))
+    (scene,) = tmp_path.glob("predictions/*/none/scene0/scene.json")
+    assert json.loads(scene.read_text())["source_views"] == ["000000"]

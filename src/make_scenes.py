@@ -1,13 +1,15 @@
 """Render procedural scenes: `python src/make_scenes.py scenes=cars`."""
 
-import hydra
 from omegaconf import DictConfig
 
-from nerfdiff.scenes.generate import make_scenes
+from nerfdiff.cli import entry_point
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="make_scenes")
+@entry_point("make_scenes")
 def main(cfg: DictConfig) -> None:
+    """Scenes already there are kept."""
+    from nerfdiff.scenes.generate import make_scenes
+
     make_scenes(cfg)
 
 

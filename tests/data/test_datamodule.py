@@ -27,6 +27,8 @@ def datamodule(root, **changes) -> SceneDataModule:
         "root": root / "data",
         "image_size": None,
         "reader": partial(SRNReader, category="cars", near=NEAR, far=FAR),
+        "train_scenes": None,
+        "train_source_view": None,
         "target_views": 2,
         "source_as_target": 0.2,
         "batch_size": 6,

@@ -90,3 +90,13 @@ def test_a_resumed_run_goes_on_with_the_next_draw(world_size, micro):
 def test_the_length_is_that_of_the_whole_run():
     assert len(DrawSampler(12, 3, 1, 2, start_step=4, total_steps=6)) == 12
     assert len(list(DrawSampler(12, 3, 1, 2, start_step=4, total_steps=6))) == 4
+
+
+def test_a_fixed_source_is_never_its_own_target_unless_asked():
+    draws = Draws(seed=0, scenes=2, target_views=3, source_as_target=0.0)
+    seen = set()
+    for draw in range(50):
+        source, targets = draws.views(draw, 6, source=4)
+        assert source == 4 and 4 not in targets and len(set(targets)) == 3
+        seen.update(targets)
+    assert seen == {0, 1, 2, 3, 5}

@@ -78,3 +78,9 @@ def test_pose_text_is_one_line_that_reads_back_exactly():
     text = pose_text(pose)
     assert "\n" not in text
     assert np.array_equal(np.array(text.split(), np.float64).reshape(4, 4), pose)
+
+
+def test_elevations_bound_the_training_views_evenly():
+    heights = random_sphere(2.0, 4000, np.random.default_rng(3), (0.0, 30.0))[:, 2, 3] / 2
+    assert heights.min() >= 0 and heights.max() <= 0.5
+    assert abs(heights.mean() - 0.25) < 0.01

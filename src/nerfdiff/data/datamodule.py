@@ -14,7 +14,7 @@ from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.cache import CachedReader
 from nerfdiff.data.draws import Draws, DrawSampler
 from nerfdiff.data.scene import MissingSplit, SceneReader
-from nerfdiff.data.views import EvaluationScenes, TrainingViews
+from nerfdiff.data.views import EvaluationScenes, TrainingViews, spread
 from nerfdiff.errors import ConfigError
 
 log = logging.getLogger(__name__)
@@ -33,6 +33,8 @@ class SceneDataModule(LightningDataModule):
         root: the dataset's folder.
         image_size: side in pixels, or (height, width), to which all images are resized (None: as stored).
         reader: makes the reader of a split, as `reader(root=..., split=..., image_size=...)`.
+        train_scenes: how many scenes to train on, spread evenly over the split (None: all).
+        train_source_view: number of the view that every draw takes as its source (None: any view).
         target_views: T, target views per training draw.
         source_as_target: probability that a draw's first target is its source view.
         batch_size: draws per optimizer step, over all ranks and accumulated batches.
@@ -56,6 +58,8 @@ class SceneDataModule(LightningDataModule):
         root: str | Path,
         image_size: int | Sequence[int] | None,
         reader: Callable[..., SceneReader],
+        train_scenes: int | None,
+        train_source_view: int | None,
         target_views: int,
         source_as_target: float,
         batch_size: int,
@@ -80,6 +84,7 @@ class SceneDataModule(LightningDataModule):
             "batch_size": batch_size,
             "val_scenes": val_scenes,
             "val_targets": val_targets,
+            "train_scenes": 1 if train_scenes is None else train_scenes,
             "eval_scenes": 1 if eval_scenes is None else eval_scenes,
             "eval_stride": eval_stride,
         }
@@ -92,6 +97,7 @@ class SceneDataModule(LightningDataModule):
             raise ConfigError(f"data.seed={seed} must be from 0 to 2^64 - 1")
         self.name, self.make_reader = name, reader
         self.root, self.image_size = root, image_size
+        self.train_scenes, self.train_source_view = train_scenes, train_source_view
         self.target_views, self.source_as_target = target_views, source_as_target
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
         self.val_source_view, self.val_scenes, self.val_targets = val_source_view, val_scenes, val_targets
@@ -160,7 +166,8 @@ class SceneDataModule(LightningDataModule):
                 f"data.batch_size={self.batch_size} is not divisible by {world_size} processes x "
                 f"trainer.accumulate_grad_batches={accumulate}"
             )
-        draws = Draws(self.seed, len(self.train_reader), self.target_views, self.source_as_target)
+        scenes = len(spread(len(self.train_reader), self.train_scenes))
+        draws = Draws(self.seed, scenes, self.target_views, self.source_as_target)
         sampler = DrawSampler(
             self.batch_size,
             micro_batch_size,
@@ -170,7 +177,7 @@ class SceneDataModule(LightningDataModule):
             total_steps=total_steps,
         )
         return TrainingLoader(
-            TrainingViews(self.train_reader, draws),
+            TrainingViews(self.train_reader, draws, self.train_source_view),
             batch_sampler=sampler,
             num_workers=self.num_workers,
             **_common_options(),

@@ -48,11 +48,16 @@ class Draws:
         epoch, position = divmod(draw, self.scenes)
         return int(scene_order(self.seed, epoch, self.scenes)[position])
 
-    def views(self, draw: int, views: int) -> tuple[int, tuple[int, ...]]:
-        """Source and target positions among the scene's `views`, which must be more than `target_views`."""
+    def views(self, draw: int, views: int, source: int | None = None) -> tuple[int, tuple[int, ...]]:
+        """Source and target positions among the scene's `views`, which must be more than `target_views`.
+
+        Args:
+            source: the source's position, where it is not to be drawn.
+        """
         bits = random_bits(self.seed, VIEWS, draw, views + 1)
-        source, *others = np.argsort(bits[:views], kind="stable").tolist()
-        targets = others[: self.target_views]
+        order = np.argsort(bits[:views], kind="stable").tolist()
+        source = order[0] if source is None else source
+        targets = [view for view in order if view != source][: self.target_views]
         if bits[views] < self.source_as_target * 2.0**64:
             targets[0] = source
         return source, tuple(targets)

@@ -11,22 +11,29 @@ from nerfdiff.errors import DataError
 class TrainingViews(Dataset[Sample]):
     """Item n is draw n of the run; any n ≥ 0 is valid.
 
+    Args:
+        reader: the split to train on.
+        draws: over as many scenes as are trained on, spread evenly over the split.
+        source_view: number of the view that every draw takes as its source (None: any view).
+
     Raises:
-        DataError: a scene has too few views, or its files are damaged.
+        DataError: a scene has too few views or no such source view, or its files are damaged.
     """
 
-    def __init__(self, reader: SceneReader, draws: Draws):
-        self.reader, self.draws = reader, draws
+    def __init__(self, reader: SceneReader, draws: Draws, source_view: int | None = None):
+        self.reader, self.draws, self.source_view = reader, draws, source_view
+        self.indices = spread(len(reader), draws.scenes)
 
     def __getitem__(self, draw: int) -> Sample:
-        index = self.draws.scene(draw)
+        index = self.indices[self.draws.scene(draw)]
         count = len(self.reader.view_names(index))
         if count <= self.draws.target_views:
             raise DataError(
                 f"scene {self.reader.scene_id(index)} has {count} views; a source and "
                 f"data.target_views={self.draws.target_views} targets need {self.draws.target_views + 1}"
             )
-        source, targets = self.draws.views(draw, count)
+        fixed = None if self.source_view is None else position_of(self.reader, index, self.source_view)
+        source, targets = self.draws.views(draw, count, fixed)
         wanted = sorted({source, *targets})
         scene = self.reader.load(index, wanted)
         return Sample(scene, wanted.index(source), [wanted.index(t) for t in targets], draw)
@@ -55,10 +62,10 @@ class EvaluationScenes(Dataset[Sample]):
         targets: int | None = None,
         stride: int = 1,
     ):
-        self.reader, self.source_view = reader, source_view
+        self.reader = reader
         self.indices = spread(len(reader), scenes)
         # looked up now, so that a long run does not fail at its first validation
-        self.sources = [self._source(index) for index in self.indices]
+        self.sources = [position_of(reader, index, source_view) for index in self.indices]
         self.targets, self.stride = targets, stride
 
     def __len__(self) -> int:
@@ -74,16 +81,22 @@ class EvaluationScenes(Dataset[Sample]):
         scene = self.reader.load(index, [source, *targets], truth=True)
         return Sample(scene, 0, range(1, len(targets) + 1), index)
 
-    def _source(self, index: int) -> int:
-        names = self.reader.view_names(index)
-        numbered = all(name.isdecimal() for name in names)
-        numbers = [int(name) for name in names] if numbered else list(range(len(names)))
-        if self.source_view not in numbers:
-            raise DataError(
-                f"scene {self.reader.scene_id(index)} has no view {self.source_view}, but {len(names)} views "
-                f"{names[0]} to {names[-1]}; set data.source_view (or data.val_source_view) to one of them"
-            )
-        return numbers.index(self.source_view)
+
+def position_of(reader: SceneReader, index: int, view: int) -> int:
+    """Position among a scene's views of view number `view`: its name where names are numbers, else its position.
+
+    Raises:
+        DataError: there is no such view.
+    """
+    names = reader.view_names(index)
+    numbered = all(name.isdecimal() for name in names)
+    numbers = [int(name) for name in names] if numbered else list(range(len(names)))
+    if view not in numbers:
+        raise DataError(
+            f"scene {reader.scene_id(index)} has no view {view}, but {len(names)} views {names[0]} to {names[-1]}; set "
+            "data.source_view (or data.val_source_view, data.train_source_view) to one of them"
+        )
+    return numbers.index(view)
 
 
 def spread(count: int, wanted: int | None) -> list[int]:

@@ -18,7 +18,7 @@ from nerfdiff.scenes.poses import SPIRAL_VIEWS
 from nerfdiff.scenes.scene_job import BUILDERS, STYLES, SceneJob
 
 # Raised whenever a change of the code changes the files of a given seed.
-GENERATOR_VERSION = 1
+GENERATOR_VERSION = 2
 
 
 def make_scenes(cfg: DictConfig | dict[str, Any]) -> dict[str, Any]:
@@ -90,6 +90,9 @@ def _check(cfg: dict[str, Any]) -> None:
             raise ConfigError(f"{key}={value}: expected a whole number of at least 1")
     if not cfg["scenes"]["radius"] > 0.5:
         raise ConfigError(f"scenes.radius={cfg['scenes']['radius']}: expected more than 0.5, outside the object")
+    low, high = cfg["scenes"]["elevation"]
+    if not -90 <= low < high <= 90:
+        raise ConfigError(f"scenes.elevation=[{low}, {high}]: expected two ascending degrees from -90 to 90")
     if not isinstance(cfg["seed"], int) or cfg["seed"] < 0:
         raise ConfigError(f"seed={cfg['seed']}: expected an integer of at least 0")
 
@@ -100,6 +103,7 @@ def _parameters(cfg: dict[str, Any], variant: str) -> dict[str, Any]:
         "generator_version": GENERATOR_VERSION,
         "category": cfg["scenes"]["category"],
         "radius": cfg["scenes"]["radius"],
+        "elevation": cfg["scenes"]["elevation"],
         "styles": cfg["scenes"]["styles"],
         "seed": cfg["seed"],
         "resolution": cfg["resolution"],
@@ -121,6 +125,7 @@ def _plan(cfg: dict[str, Any], root: Path) -> Iterator[SceneJob]:
                 wanted["views"],
                 cfg["seed"],
                 scenes["radius"],
+                tuple(scenes["elevation"]),
                 scenes["styles"],
             )
 

@@ -38,10 +38,16 @@ def srn_spiral(radius: float, views: int = SPIRAL_VIEWS) -> Float[np.ndarray, "v
     return np.stack([look_at_origin(radius * d) for d in directions])
 
 
-def random_sphere(radius: float, views: int, rng: np.random.Generator) -> Float[np.ndarray, "views 4 4"]:
-    """Poses uniform on the whole sphere, below the ground included, as SRN's training views are."""
-    directions = rng.standard_normal((views, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+def random_sphere(
+    radius: float, views: int, rng: np.random.Generator, elevation: tuple[float, float] = (-90.0, 90.0)
+) -> Float[np.ndarray, "views 4 4"]:
+    """Poses uniform on the sphere between two elevations in degrees; SRN's training views are on all of it."""
+    low, high = np.sin(np.radians(elevation))
+    # On a sphere the height is uniform (Archimedes).
+    z = rng.uniform(low, high, views)
+    azimuth = rng.uniform(0, 2 * np.pi, views)
+    across = np.sqrt(1 - z**2)
+    directions = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=1)
     return np.stack([look_at_origin(radius * d) for d in directions])
 
 

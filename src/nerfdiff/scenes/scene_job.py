@@ -36,6 +36,7 @@ class SceneJob:
     views: int
     seed: int
     radius: float
+    elevation: tuple[float, float]
     styles: Mapping[str, float]
 
     @property
@@ -54,7 +55,7 @@ class SceneJob:
     def poses(self) -> Float[np.ndarray, "views 4 4"]:
         """Its cameras: random in training, SRN's spiral otherwise."""
         if self.split == "train":
-            return random_sphere(self.radius, self.views, self.rng("cameras"))
+            return random_sphere(self.radius, self.views, self.rng("cameras"), self.elevation)
         return srn_spiral(self.radius, self.views)
 
     def render(self, renderer: MitsubaRenderer) -> int:

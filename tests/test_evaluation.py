@@ -2,7 +2,6 @@ import json
 
 import pytest
 import torch
-from training_fixtures import run_training, write_dataset
 
 from nerfdiff.checkpoint import load_model
 from nerfdiff.cli import load_config
@@ -11,6 +10,7 @@ from nerfdiff.errors import CheckpointError, DataError
 from nerfdiff.evaluation import evaluate
 from nerfdiff.metrics.predictions import NonFinitePrediction
 from nerfdiff.results.row import read_rows
+from training_fixtures import run_training, write_dataset
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,10 @@ import time
 import pytest
 import torch
 from lightning import Callback
+
+from nerfdiff import training
+from nerfdiff.checkpoint import load_model
+from nerfdiff.errors import CheckpointError, DataError
 from training_fixtures import (
     assert_same_state,
     command,
@@ -17,10 +21,6 @@ from training_fixtures import (
     run_training,
     write_dataset,
 )
-
-from nerfdiff import training
-from nerfdiff.checkpoint import load_model
-from nerfdiff.errors import CheckpointError, DataError
 
 
 @pytest.fixture(scope="module")

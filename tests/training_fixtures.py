@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 
 import torch
-from data_fixtures import write_scene
 
+from data_fixtures import write_scene
 from nerfdiff.cli import load_config
 from nerfdiff.training import train
 

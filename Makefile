@@ -29,4 +29,4 @@ dashboard: setup
 	$(BIN)/tensorboard --logdir runs
 
 clean:
-	rm -rf runs data/demo outputs multirun
+	rm -rf runs/demo data/demo

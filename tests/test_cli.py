@@ -3,9 +3,14 @@ import sys
 from pathlib import Path
 
 import pytest
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from torch.utils.data import DataLoader, Dataset
 
-from nerfdiff.cli import CONF, check_overrides, load_config
-from nerfdiff.errors import ConfigError
+from nerfdiff.cli import CONF, check_overrides, entry_point, explain, load_config
+from nerfdiff.errors import ConfigError, DataError
 
 SRC = Path(__file__).parents[1] / "src"
 
@@ -54,6 +59,16 @@ def test_the_papers_numbers():
         ("trainer.max_steps=true", ["takes int"]),
         ("trainer.max_steps=10,many", ["takes int", "'many'"]),
         ("a=[1,2", ["a=[1,2"]),
+        ("model=tiny,huge", ["no model/huge", "base", "large", "small", "tiny"]),
+        ("hydra/launcher=nope", ["no hydra/launcher/nope", "basic"]),
+        ("logger=null", ["logger takes tensorboard, got null", "~logger"]),
+        ("logger=tensorboard,null", ["logger takes tensorboard, got null"]),
+        ("trainer=null", ["trainer takes auto or cpu or ddp or gpu, got null"]),
+        ("optimizer=1", ["optimizer takes paper or small, got 1"]),
+        ("model.unet.channel_mult=3", ["model.unet.channel_mult takes a list (default [1, 1, 2, 3, 4]), got 3"]),
+        ("model.unet.channel_mult=[1,2],3", ["takes a list", "got 3"]),
+        ("model.unet=wide", ["model.unet takes a mapping (keys width, channel_mult", "'wide'"]),
+        ("trainer.max_steps=[10]", ["takes int"]),
     ],
 )
 def test_what_is_wrong_is_said_with_what_is_right(override, words):
@@ -65,10 +80,108 @@ def test_what_is_wrong_is_said_with_what_is_right(override, words):
 @pytest.mark.parametrize(
     "override",
     ["+trainer.fast_dev_run=true", "~logger", "optimizer.lr=1", "data.eval_scenes=3", "callbacks.previews=null",
-     "model=tiny,base", "seed=1,2,3", "run_name=${data.name}", "hydra.job.chdir=false", "threads=2"],
+     "model=tiny,base", "seed=1,2,3", "run_name=${data.name}", "hydra.job.chdir=false", "threads=2",
+     "hydra/sweeper=basic", "hydra/job_logging=stdout", "hydra.verbose=lightning", "++trainer.x=1", "++seed=x",
+     "model=glob(*)", "optimizer.lr=interval(0,1)", "seed=range(1,4)", "model.unet.channel_mult=[1,2]",
+     "model.unet={width:64}", "callbacks={previews:null}", "data.image_size=32", "data.image_size=[32,64]",
+     "~logger=tensorboard"],
 )  # fmt: skip
 def test_what_is_right_passes(override):
     check_overrides("train", [override])
+
+
+def test_a_value_must_suit_every_choice_of_a_sweep():
+    check_overrides("evaluate", ["strategy=cdm", "strategy.steps=8"])
+    with pytest.raises(ConfigError, match=r"strategy\.steps is not a key"):
+        check_overrides("evaluate", ["strategy=cdm,none", "strategy.steps=8"])
+
+
+def test_running_without_a_logger():
+    assert "logger" not in load_config("train", ["~logger"])
+
+
+class Demanding:
+    """Constructed from a config, it finds fault."""
+
+    def __init__(self, fault: str):
+        if fault == "user":
+            try:
+                Path("/nowhere/at/all").read_bytes()
+            except OSError as error:
+                raise DataError("data.root=/nowhere does not exist; set data.root") from error
+        raise TypeError("a fault\nof two lines")
+
+
+@pytest.mark.parametrize(
+    ("node", "message"),
+    [
+        ({"fault": "user"}, "data.root=/nowhere does not exist; set data.root"),
+        ({"fault": "other"}, "part: Error in call to target 'test_cli.Demanding': TypeError: a fault of two lines"),
+        ({"fault": "???"}, "part.fault must be given: add part.fault=<value>"),
+    ],
+)
+@pytest.mark.parametrize("nested", [False, True])
+def test_what_a_constructor_raised_is_explained(node, message, nested):
+    node = {"_target_": f"{__name__}.Demanding"} | node
+    key = "part"
+    if nested:
+        node, key = {"_target_": "builtins.dict", "inner": node}, "part.inner"
+    with pytest.raises((InstantiationException, OmegaConfBaseException)) as error:
+        instantiate(OmegaConf.create({"part": node}).part)
+    expected = message.replace("part", key).replace("test_cli", __name__)
+    assert explain(error.value) == expected
+
+
+def test_a_missing_class_is_explained():
+    with pytest.raises(InstantiationException) as error:
+        instantiate({"_target_": "nerfdiff.nothing.Here"})
+    message = explain(error.value)
+    assert "nerfdiff.nothing.Here" in message and "\n" not in message
+
+
+class Damaged(Dataset):
+    def __len__(self):
+        return 1
+
+    def __getitem__(self, index):
+        try:
+            raise DataError("the cause")
+        except DataError as error:
+            raise DataError("a.png is damaged: delete it\nand render it again") from error
+
+
+def test_what_a_worker_raised_is_explained():
+    with pytest.raises(DataError) as error:
+        next(iter(DataLoader(Damaged(), num_workers=1)))
+    assert "Traceback" in str(error.value)
+    assert explain(error.value) == "a.png is damaged: delete it\nand render it again"
+
+
+def test_other_errors_keep_their_traceback():
+    assert explain(KeyError("x")) is None
+    bug = ValueError("of the program")
+    bug.__cause__ = DataError("handled before")
+    assert explain(bug) is None
+
+
+def test_config_errors_are_explained():
+    cfg = load_config("evaluate", [])
+    with pytest.raises(OmegaConfBaseException) as error:
+        cfg.ckpt  # noqa: B018
+    assert explain(error.value) == "ckpt must be given: add ckpt=<value>"
+    with pytest.raises(OmegaConfBaseException) as error:
+        cfg.data.rooot  # noqa: B018
+    assert explain(error.value) == "data.rooot: Key 'rooot' is not in struct"
+
+
+def test_a_command_ends_with_the_explanation(monkeypatch, tmp_path):
+    arguments = ["hydra/job_logging=none", "hydra/hydra_logging=none", "hydra.output_subdir=null"]
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", *arguments, f"hydra.run.dir={tmp_path}"])
+    command = entry_point("evaluate")(lambda cfg: cfg.ckpt)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    with pytest.raises(SystemExit) as end:
+        command()
+    assert end.value.code == "error: ckpt must be given: add ckpt=<value>"
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess:

@@ -3,10 +3,10 @@ import json
 import pytest
 import torch
 
-from nerfdiff.checkpoint import load_model
+from nerfdiff.checkpoint import export, load_model
 from nerfdiff.cli import load_config
 from nerfdiff.distill.none import SingleImageNeRF
-from nerfdiff.errors import CheckpointError, DataError
+from nerfdiff.errors import CheckpointError, ConfigError, DataError
 from nerfdiff.evaluation import evaluate
 from nerfdiff.metrics.predictions import NonFinitePrediction
 from nerfdiff.results.row import read_rows
@@ -21,7 +21,7 @@ def data(tmp_path_factory):
 @pytest.fixture(scope="module")
 def run(data, tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    run_training(data, folder, "trainer.max_steps=2")
+    run_training(data, folder, "trainer.max_steps=2", "data.image_size=[20,28]")
     return folder
 
 
@@ -52,11 +52,15 @@ def test_an_evaluation_leaves_rows_scores_and_pictures(data, run, tmp_path, stra
     for row in rows:
         assert row.status == "ok" and row.n_scenes == 2 and row.n_views == 2 * 4
         assert 0 < row.psnr < 60 and row.ssim_impl == "skimage-uniform7" and row.st_lpips_vgg > 0
-        assert (tmp_path / "scores" / row.strategy / "per_image.csv").is_file()
-        assert (tmp_path / "scores" / row.strategy / "per_scene.csv").is_file()
-    assert (tmp_path / f"sheet_{name}.png").stat().st_size > 1000
-    assert (tmp_path / f"orbit_{name}.mp4").stat().st_size > 500
-    assert name in (tmp_path / f"table_{name}.md").read_text()
+    (folder,) = tmp_path.glob(f"{name}-*")
+    for row in rows:
+        assert (folder / "scores" / row.strategy / "per_image.csv").is_file()
+        assert (folder / "scores" / row.strategy / "per_scene.csv").is_file()
+        assert row.image_size == [20, 28]
+    assert (folder / "sheet.png").stat().st_size > 1000
+    assert (folder / "orbit.mp4").stat().st_size > 500
+    assert name in (folder / "table.md").read_text()
+    assert len({row.run_id for row in rows}) == 3
 
 
 def test_costs_are_counted(data, run, tmp_path):
@@ -76,7 +80,9 @@ def test_copying_the_input_scores_what_the_files_say(data, run, tmp_path):
     import numpy as np
     from PIL import Image
 
-    rows = evaluate(config(data, run, tmp_path, "data.image_size=null"))
+    checkpoint = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
+    torch.save(checkpoint | {"image_size": None}, tmp_path / "any_size.ckpt")
+    rows = evaluate(config(data, tmp_path / "any_size.ckpt", tmp_path, "data.image_size=null"))
     scenes = []
     for scene in sorted((data / "cars_test").iterdir()):
         views = [np.asarray(Image.open(p), float) / 255 for p in sorted((scene / "rgb").iterdir())]
@@ -152,10 +158,38 @@ def test_missing_checkpoints_and_data_are_named(data, run, tmp_path):
         evaluate(config(tmp_path / "nowhere", run, tmp_path))
 
 
+def test_another_resolution_than_in_training_is_named(data, run, tmp_path):
+    with pytest.raises(ConfigError, match=r"set data\.image_size=\[20,28\]"):
+        evaluate(config(data, run, tmp_path, "data.image_size=null"))
+
+
+@pytest.mark.parametrize(("setting", "word"), [("device=cuda:7", "device=auto"), ("precision=16-mixed", "bf16-mixed")])
+def test_what_this_machine_cannot_do_is_said(data, run, tmp_path, setting, word):
+    with pytest.raises(ConfigError, match=word):
+        evaluate(config(data, run, tmp_path, setting))
+
+
+def test_weights_can_be_shared_at_half_the_size(run, tmp_path):
+    whole = export(str(run), "ema", tmp_path / "whole", "float32", tmp_path)
+    half = export(str(run), "ema", tmp_path / "half", "float16", tmp_path)
+    assert half.stat().st_size < 0.6 * whole.stat().st_size
+    first, second = (load_model(path.parent, "ema", tmp_path).model.state_dict() for path in (whole, half))
+    assert all(torch.allclose(first[name], second[name], rtol=1e-3, atol=1e-4) for name in first)
+    with pytest.raises(ConfigError, match="float32, bfloat16, float16"):
+        export(str(run), "ema", tmp_path / "bad", "int8", tmp_path)
+
+
+def test_samples_do_not_depend_on_what_is_sampled_beside_them(data, run, tmp_path):
+    more = ("baselines=false", "orbit.scenes=0", "strategy=cdm", "strategy.steps=3", "strategy.eta=1.0")
+    together = evaluate(config(data, run, tmp_path / "a", *more))[0]
+    apart = evaluate(config(data, run, tmp_path / "b", *more, "strategy.views_at_once=1"))[0]
+    assert apart.psnr == pytest.approx(together.psnr, abs=1e-3)
+
+
 def test_files_that_are_no_checkpoints_are_refused(tmp_path):
     for name, content in {"a.ckpt": b"nonsense", "b.safetensors": b"\0" * 64}.items():
         (tmp_path / name).write_bytes(content)
-        (tmp_path / "model.yaml").write_text("{}")
+        (tmp_path / "model.yaml").write_text("{weights: ema, image_size: null, model: {}}")
         with pytest.raises(CheckpointError, match=name):
             load_model(tmp_path / name, "ema", tmp_path)
     torch.save({"state_dict": {}}, tmp_path / "c.ckpt")
@@ -176,5 +210,5 @@ def test_a_checkpoint_never_runs_code(tmp_path):
 
 def test_predictions_name_their_source_view(data, run, tmp_path):
     evaluate(config(data, run, tmp_path, "baselines=false"))
-    (scene,) = tmp_path.glob("predictions/*/none/scene0/scene.json")
+    (scene,) = tmp_path.glob("none-*/predictions/none/scene0/scene.json")
     assert json.loads(scene.read_text())["source_views"] == ["000000"]

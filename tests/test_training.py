@@ -137,6 +137,38 @@ def test_exported_and_checkpointed_averages_agree(whole):
     assert any(not torch.equal(from_run[name], raw[name]) for name in from_run)
 
 
+def test_the_same_command_on_a_finished_run_exports_the_same_average(data, tmp_path):
+    run_training(data, tmp_path)
+    first = load_model(tmp_path / "model", "ema", tmp_path)
+    run_training(data, tmp_path)
+    again = load_model(tmp_path / "model", "ema", tmp_path)
+    assert first.image_size == again.image_size == [10, 14]
+    for name, value in first.model.state_dict().items():
+        assert torch.equal(value, again.model.state_dict()[name])
+
+
+def test_a_resumed_run_follows_the_optimizer_settings_it_is_given(data, tmp_path):
+    constant = ("optimizer.decay=none", "optimizer.warmup_steps=0")
+    run_training(data, tmp_path, "trainer.max_steps=2", *constant, "optimizer.lr=0.001")
+    metrics = run_training(data, tmp_path, "trainer.max_steps=4", *constant, "optimizer.lr=0.0002")
+    assert metrics["lr-AdamW"] == pytest.approx(0.0002)
+
+
+def test_memory_settings_may_change_on_resuming_but_accumulation_may_not(data, tmp_path):
+    run_training(data, tmp_path, "trainer.max_steps=2")
+    with pytest.raises(CheckpointError, match="accumulate_grad_batches: 1 → 2"):
+        run_training(data, tmp_path, "trainer.accumulate_grad_batches=2")
+    run_training(data, tmp_path, "trainer.max_steps=4", "model.render.chunk=100", "model.unet.checkpointing=true")
+    assert last_checkpoint(tmp_path)["global_step"] == 4
+
+
+def test_without_logger_and_average(data, tmp_path):
+    run_training(data, tmp_path, "trainer.max_steps=2", "~logger", "callbacks.ema=null")
+    assert load_model(tmp_path / "model", "raw", tmp_path).weights == "raw"
+    with pytest.raises(CheckpointError, match="use weights=raw"):
+        load_model(tmp_path / "model", "ema", tmp_path)
+
+
 def test_resuming_with_another_model_is_refused_by_name(data, whole):
     with pytest.raises(CheckpointError, match=re.escape("model.field.channels: 4 → 6")):
         run_training(data, whole[0], "model.field.channels=6")

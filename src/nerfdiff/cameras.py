@@ -133,9 +133,12 @@ class Cameras:
         return Rays(origins, directions, *near_far)
 
     def project(
-        self, points: Float[Tensor, "*batch n 3"]
+        self, points: Float[Tensor, "*#batch n 3"]
     ) -> tuple[Float[Tensor, "*batch n 2"], Float[Tensor, "*batch n"]]:
-        """World points to (u, v) pixels and depth z. Points with z <= 0 give meaningless pixels."""
+        """World points (broadcast over batch axes) to (u, v) pixels and depth z.
+
+        Points with z <= 0 give meaningless pixels.
+        """
         offsets = points - self.centres[..., None, :]
         with full_precision(self.c2w.device):
             local = torch.einsum("...ji,...nj->...ni", self.c2w[..., :3, :3], offsets)

@@ -1,6 +1,5 @@
 """From a file to a model: Lightning checkpoints and exported weights, always read as plain tensors."""
 
-import os
 import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,12 +11,13 @@ import yaml
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from nerfdiff.errors import CheckpointError
+from nerfdiff.errors import CheckpointError, ConfigError
 from nerfdiff.model import NerfDiff
 from nerfdiff.results.files import atomic, write_text
 
 WEIGHTS = "model.safetensors"
 CONFIG = "model.yaml"
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 _PREFIX = "model."
 
 
@@ -29,11 +29,15 @@ class LoadedModel:
         model: on the CPU, in evaluation mode.
         path: the file its weights were read from.
         weights: `ema` or `raw`.
+        config: arguments of `NerfDiff`.
+        image_size: (height, width) of the images it was trained on, if known.
     """
 
     model: NerfDiff
     path: Path
     weights: str
+    config: Mapping
+    image_size: list[int] | None
 
 
 def load_model(ckpt: str | Path, weights: str, assets: str | Path) -> LoadedModel:
@@ -50,7 +54,7 @@ def load_model(ckpt: str | Path, weights: str, assets: str | Path) -> LoadedMode
     """
     if weights not in ("ema", "raw"):
         raise CheckpointError(f"weights must be ema or raw, got {weights!r}")
-    candidates = [Path(ckpt), Path(ckpt) / "checkpoints" / "last.ckpt", Path(ckpt) / WEIGHTS]
+    candidates = [Path(ckpt), last_checkpoint(ckpt), Path(ckpt) / WEIGHTS]
     candidates.append(Path(assets) / ckpt / WEIGHTS)
     path = next((c for c in candidates if c.is_file()), None)
     if path is None:
@@ -59,8 +63,9 @@ def load_model(ckpt: str | Path, weights: str, assets: str | Path) -> LoadedMode
             f"ckpt={ckpt} is neither a file nor a folder of a run; looked for "
             f"{', '.join(map(str, candidates))}. Shipped models: {', '.join(shipped) or 'none'}"
         )
-    config, state = _read_export(path, weights) if path.suffix == ".safetensors" else _read_ckpt(path, weights)
-    return LoadedModel(_build(config, state, path), path, weights)
+    read = _read_export if path.suffix == ".safetensors" else _read_ckpt
+    config, image_size, state = read(path, weights)
+    return LoadedModel(_build(config, state, path), path, weights, config, image_size)
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -70,7 +75,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         CheckpointError: the file is missing, damaged, or no checkpoint of this project.
     """
     try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except FileNotFoundError as error:
         raise CheckpointError(f"checkpoint {path} does not exist") from error
     except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
@@ -82,19 +87,31 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     return checkpoint
 
 
-def export_model(model: NerfDiff, config: Mapping, folder: str | Path, dtype: torch.dtype) -> Path:
-    """Write weights (safetensors) and the model's settings (YAML) that rebuild it.
+def export_model(loaded: LoadedModel, folder: str | Path, dtype: torch.dtype) -> Path:
+    """Write weights (safetensors) and the settings (YAML) that rebuild the model.
 
     Args:
-        config: arguments of `NerfDiff`, as plain data.
         dtype: of the stored weights.
     """
     folder = Path(folder)
-    state = {name: value.detach().to("cpu", dtype).contiguous() for name, value in model.state_dict().items()}
+    state = {name: value.to("cpu", dtype).contiguous() for name, value in loaded.model.state_dict().items()}
     with atomic(folder / WEIGHTS) as temporary:
         save_file(state, temporary)
-    write_text(folder / CONFIG, yaml.safe_dump(dict(config), sort_keys=False))
+    settings = {"weights": loaded.weights, "image_size": loaded.image_size, "model": dict(loaded.config)}
+    write_text(folder / CONFIG, yaml.safe_dump(settings, sort_keys=False))
     return folder / WEIGHTS
+
+
+def export(ckpt: str, weights: str, out: str | Path, dtype: str, assets: str | Path) -> Path:
+    """`load_model`, then `export_model`; returns the file.
+
+    Raises:
+        CheckpointError: see `load_model`.
+        ConfigError: `dtype` is not a floating-point type to store weights in.
+    """
+    if dtype not in DTYPES:
+        raise ConfigError(f"dtype must be one of {', '.join(DTYPES)}, got {dtype!r}")
+    return export_model(load_model(ckpt, weights, assets), out, DTYPES[dtype])
 
 
 def differences(old: Mapping, new: Mapping, prefix: str = "") -> list[str]:
@@ -109,13 +126,23 @@ def differences(old: Mapping, new: Mapping, prefix: str = "") -> list[str]:
     return found
 
 
-def check_resumable(path: str | Path, model_config: Mapping) -> None:
-    """Refuse to resume a run whose model has other settings.
+def check_resumable(path: str | Path, model_config: Mapping, accumulate: int) -> None:
+    """Refuse to resume a run whose model or accumulation has other settings.
+
+    Settings that trade memory for time (`chunk`, `checkpointing`) may change: the model is the same.
 
     Raises:
         CheckpointError: naming every setting that differs.
     """
-    changed = differences(read_checkpoint(path)["hyper_parameters"]["model"], model_config, "model.")
+    checkpoint = read_checkpoint(path)
+    changed = [
+        difference
+        for difference in differences(checkpoint["hyper_parameters"]["model"], model_config, "model.")
+        if not difference.startswith(("model.render.chunk:", "model.unet.checkpointing:"))
+    ]
+    before = checkpoint.get("accumulate_grad_batches", accumulate)
+    if before != accumulate:  # Lightning counts batches, of which a step would then have another number
+        changed.append(f"trainer.accumulate_grad_batches: {before} → {accumulate}")
     if changed:
         raise CheckpointError(
             f"{path} was trained with other settings ({'; '.join(changed)}). Resume with those, or choose another "
@@ -123,28 +150,31 @@ def check_resumable(path: str | Path, model_config: Mapping) -> None:
         )
 
 
-def _read_ckpt(path: Path, weights: str) -> tuple[Mapping, dict[str, torch.Tensor]]:
+def _read_ckpt(path: Path, weights: str) -> tuple[Mapping, list[int] | None, dict[str, torch.Tensor]]:
     checkpoint = read_checkpoint(path)
     averaged = "current_model_state" in checkpoint
     if weights == "ema" and not averaged:
         raise CheckpointError(f"{path} holds no averaged weights (no EMA callback in that run): use weights=raw")
     state = checkpoint["current_model_state" if weights == "raw" and averaged else "state_dict"]
-    return checkpoint["hyper_parameters"]["model"], {
-        name.removeprefix(_PREFIX): value for name, value in state.items() if name.startswith(_PREFIX)
-    }
+    state = {name.removeprefix(_PREFIX): value for name, value in state.items() if name.startswith(_PREFIX)}
+    return checkpoint["hyper_parameters"]["model"], checkpoint.get("image_size"), state
 
 
-def _read_export(path: Path, weights: str) -> tuple[Mapping, dict[str, torch.Tensor]]:
-    if weights == "raw":
-        raise CheckpointError(f"{path} holds averaged weights only: use weights=ema")
-    settings = path.with_name(CONFIG)
-    if not settings.is_file():
-        raise CheckpointError(f"{settings} is missing: it holds the sizes that {path.name} was trained with")
+def _read_export(path: Path, weights: str) -> tuple[Mapping, list[int] | None, dict[str, torch.Tensor]]:
+    try:
+        settings = yaml.safe_load(path.with_name(CONFIG).read_text())
+        stored, image_size, config = settings["weights"], settings["image_size"], settings["model"]
+    except (OSError, yaml.YAMLError, KeyError, TypeError) as error:
+        raise CheckpointError(
+            f"{path.with_name(CONFIG)} cannot be read ({error!r}); it holds the sizes that {path.name} was trained with"
+        ) from error
+    if weights != stored:
+        raise CheckpointError(f"{path} holds {stored} weights only: use weights={stored}")
     try:
         state = load_file(path)
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{path} is not a readable safetensors file ({error})") from error
-    return yaml.safe_load(settings.read_text()), state
+    return config, image_size, state
 
 
 def _build(config: Mapping, state: dict[str, torch.Tensor], path: Path) -> NerfDiff:
@@ -156,7 +186,6 @@ def _build(config: Mapping, state: dict[str, torch.Tensor], path: Path) -> NerfD
     return model.eval()
 
 
-def find_last(folder: str | os.PathLike) -> Path | None:
-    """`last.ckpt` of a run's folder, if training has got that far."""
-    path = Path(folder) / "checkpoints" / "last.ckpt"
-    return path if path.is_file() else None
+def last_checkpoint(run: str | Path) -> Path:
+    """Where a run keeps the checkpoint it resumes from."""
+    return Path(run) / "checkpoints" / "last.ckpt"

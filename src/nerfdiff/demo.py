@@ -40,7 +40,7 @@ def demo(cfg: DictConfig) -> list[ResultRow]:
 
     console.print(Rule("held-out views of unseen cars"), rich_table(rows))
     write_markdown(run / "table.md", rows)
-    pictures = [*sorted((run / "evaluation").glob("sheet_*.png")), *sorted((run / "evaluation").glob("orbit_*.mp4"))]
+    pictures = sorted((run / "evaluation").glob("*/*.png")) + sorted((run / "evaluation").glob("*/*.mp4"))
     console.print("Open:", *(f"  {path}" for path in pictures), f"  {run / 'previews'}", sep="\n")
     console.print(f"{(time.perf_counter() - started) / 60:.1f} minutes")
     return rows

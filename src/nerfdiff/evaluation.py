@@ -6,7 +6,7 @@ import resource
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch.utils.data import DataLoader
 
-from nerfdiff.checkpoint import load_model
+from nerfdiff.checkpoint import LoadedModel, load_model
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.baselines import CopyInput, MeanImage, mean_training_image
 from nerfdiff.distill.strategy import Strategy
+from nerfdiff.errors import ConfigError
 from nerfdiff.metrics.image import psnr
 from nerfdiff.metrics.predictions import SCENE, NonFinitePrediction, PredictionWriter, read_prediction
 from nerfdiff.metrics.score import truth_from
@@ -37,6 +38,8 @@ from nerfdiff.training import auto_precision, plain
 
 log = logging.getLogger(__name__)
 
+PRECISIONS = ("32-true", "bf16-mixed")
+
 
 @dataclass(frozen=True)
 class Subject:
@@ -49,7 +52,11 @@ class Subject:
     device: torch.device
     precision: str
     identity: dict[str, Any]
-    predictions: Path
+    folder: Path
+
+    @property
+    def predictions(self) -> Path:
+        return self.folder / "predictions"
 
     def autocast(self):
         """bf16 products where the precision asks for them."""
@@ -61,20 +68,22 @@ class Subject:
 def evaluate(cfg: DictConfig) -> list[ResultRow]:
     """Evaluate `cfg.strategy`, and the baselines beside it, on one split of a dataset.
 
-    Leaves in `cfg.paths.output_dir`: `predictions/<identity>/<strategy>/`, `scores/<strategy>/`, a contact sheet,
-    an orbit video and a table; appends a row per strategy to `cfg.results`. Scenes already predicted by the same
-    model with the same settings are not predicted again.
+    Leaves in `<cfg.paths.output_dir>/<strategy>-<identity>/`: `predictions/<strategy>/`, `scores/<strategy>/`, a
+    contact sheet, an orbit video and a table; appends a row per strategy to `cfg.results`. Scenes already predicted
+    by the same model with the same settings on the same files are not predicted again.
 
     Returns:
         the strategy's row, then the baselines'.
 
     Raises:
-        UserError: bad data, config or checkpoint. What failed is appended as a row with its status first.
+        UserError: bad data, config or checkpoint. A strategy that fails is appended as a row with its status first.
     """
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
-    device = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if cfg.device == "auto" else cfg.device)
+    device = _device(cfg.device)
     precision = cfg.precision if cfg.precision != "auto" else auto_precision(device.type)
+    if precision not in PRECISIONS:
+        raise ConfigError(f"precision must be auto, {' or '.join(PRECISIONS)}, got {precision!r}")
     loaded = load_model(cfg.ckpt, cfg.weights, cfg.paths.assets_dir)
     datamodule = instantiate(cfg.data)
     datamodule.setup("test")
@@ -84,13 +93,19 @@ def evaluate(cfg: DictConfig) -> list[ResultRow]:
         "ckpt_sha256": sha256_file(loaded.path),
         "weights": loaded.weights,
         "split_sha256": sha256_values(scene_ids),
-        "data_sha256": sha256_values(cfg.data),
+        "files_sha256": reader.fingerprint(),
+        "views": [cfg.data.source_view, cfg.data.eval_stride],
+        "image_size": list(next(iter(datamodule.test_dataloader())).source.shape[-2:]),
+        "mean_image_scenes": cfg.mean_image_scenes,
         "seed": cfg.seed,
         "precision": precision,
+        "strategy": plain(cfg.strategy),
     }
-    out = Path(cfg.paths.output_dir)
-    folder = out / "predictions" / sha256_values(identity | {"strategy": plain(cfg.strategy)})[:12]
+    _check_size(loaded, identity["image_size"])
+    folder = Path(cfg.paths.output_dir) / f"{cfg.strategy.name}-{sha256_values(identity)[:8]}"
     model = loaded.model.to(device)
+    if cfg.chunk is not None:
+        model.renderer = replace(model.renderer, chunk=cfg.chunk)
     subject = Subject(cfg, model, datamodule.test_dataloader(), scene_ids, device, precision, identity, folder)
 
     strategies: list[Strategy] = [instantiate(cfg.strategy)]
@@ -99,38 +114,60 @@ def evaluate(cfg: DictConfig) -> list[ResultRow]:
         strategies += [CopyInput(), MeanImage(mean)]
     truth = truth_from(reader)
     scorer = instantiate(cfg.metrics)
-    rows = [_measure(subject, strategy, scorer, truth, out) for strategy in strategies]
+    rows = [_measure(subject, strategy, scorer, truth) for strategy in strategies]
 
-    sheet = _sheet(subject, strategies, truth, out / f"sheet_{cfg.strategy.name}.png")
-    video = _video(subject, strategies[0], out / f"orbit_{cfg.strategy.name}.mp4")
-    write_markdown(out / f"table_{cfg.strategy.name}.md", rows)
+    if cfg.sheet.scenes > 0:
+        log.info("contact sheet: %s", _sheet(subject, strategies, truth, folder / "sheet.png"))
+    if cfg.orbit.scenes > 0:
+        log.info("video: %s", _video(subject, strategies[0], folder / "orbit.mp4"))
+    write_markdown(folder / "table.md", rows)
     Console(width=None if sys.stdout.isatty() else 200).print(rich_table(rows))
-    log.info("pictures: %s   video: %s", sheet, video)
-    log.info("rows: %s   scores per image and scene: %s", cfg.results, out / "scores")
+    log.info("rows: %s   scores per image and scene: %s", cfg.results, folder / "scores")
     return rows
 
 
-def _measure(subject: Subject, strategy: Strategy, scorer, truth, out: Path) -> ResultRow:
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # the latter where PyTorch was built without CUDA
+        raise ConfigError(
+            f"device={name} cannot be used here ({str(error).splitlines()[0]}); try device=auto"
+        ) from error
+    return device
+
+
+def _check_size(loaded: LoadedModel, image_size: list[int]) -> None:
+    """A model is good at the resolution it was trained at; at another its numbers say little of it."""
+    if loaded.image_size is not None and loaded.image_size != image_size:
+        raise ConfigError(
+            f"{loaded.path} was trained on images of {loaded.image_size}, the data gives {image_size}: "
+            f"set data.image_size=[{loaded.image_size[0]},{loaded.image_size[1]}]"
+        )
+
+
+def _measure(subject: Subject, strategy: Strategy, scorer, truth) -> ResultRow:
     """Predict and score with one strategy; its row is appended even where it fails."""
     cfg = subject.cfg
-    config_hash = sha256_values(
-        {"strategy": asdict(strategy) if strategy.name == cfg.strategy.name else {}}
-        | {"name": strategy.name, "data": plain(cfg.data), "metrics": plain(cfg.metrics), "seed": cfg.seed}
-    )
+    overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else None
+    # What the numbers depend on: the identity of the predictions, the strategy and how it is scored.
+    config_hash = sha256_values([subject.identity, strategy.name, plain(cfg.metrics)])
     row = ResultRow(
-        run_id=f"{cfg.run_name}/{strategy.name}/{config_hash[:8]}",
+        run_id=f"{cfg.run_name}/{strategy.name}-{config_hash[:8]}",
         config_sha256=config_hash,
-        overrides=list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else None,
+        overrides=list(overrides) if overrides is not None else None,
         seed=cfg.seed,
         dataset=f"{cfg.data.name}/{cfg.data.test_split}",
         strategy=strategy.name,
         **environment(subject.device, subject.precision),
-        **{key: subject.identity[key] for key in ("ckpt_sha256", "weights", "split_sha256")},
+        **{key: subject.identity[key] for key in ("ckpt_sha256", "weights", "split_sha256", "image_size")},
     )
     try:
         costs = _predict(subject, strategy)
         summary = scorer.score(
-            subject.predictions / strategy.name, truth, out / "scores" / strategy.name, subject.device
+            subject.predictions / strategy.name, truth, subject.folder / "scores" / strategy.name, subject.device
         )
         row = replace(row, **summary, **costs)
     except Exception as error:
@@ -159,7 +196,7 @@ def _predict(subject: Subject, strategy: Strategy) -> dict[str, Any]:
         console=Console(stderr=True),
     ) as bar:
         task = bar.add_task(strategy.name, total=len(pending), psnr="–")
-        for scene in subject.scenes:
+        for scene in subject.scenes if pending else ():
             if scene.scene_ids[0] not in pending:
                 continue
             scene = scene.to(device)

@@ -63,9 +63,13 @@ class NerfDiff(nn.Module):
     def condition(self, encoding: Encoding, cameras: Cameras, rendering: Rendering) -> Condition:
         """What the CDM sees of views [batch, views], flattened into one batch axis of batch · views."""
         views = cameras.shape[1]
-        repeated = encoding.repeat(views)
-        rendered = rendering.rgb.flatten(0, 1).movedim(-1, 1)
-        return Condition(rendered, repeated.source, cameras.flatten(), repeated.triplane.near, repeated.features)
+        return Condition(
+            rendered=rendering.rgb.flatten(0, 1).movedim(-1, 1),
+            source=encoding.source.repeat_interleave(views, 0),
+            cameras=cameras.flatten(),
+            near=encoding.triplane.near.repeat_interleave(views),
+            features=[feature.repeat_interleave(views, 0) for feature in encoding.features],
+        )
 
     def denoise(
         self, z: Float[Tensor, "batch 3 height width"], t: Tensor, condition: Condition

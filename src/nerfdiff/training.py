@@ -1,18 +1,18 @@
 """One training run, from a composed config to a model on disk."""
 
 import logging
-import shutil
 from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from lightning import Trainer, seed_everything
 from omegaconf import DictConfig, OmegaConf
 
 from nerfdiff.callbacks.checkpoint import ClearCheckpointIO
-from nerfdiff.checkpoint import check_resumable, export_model, find_last
-from nerfdiff.errors import CheckpointError
+from nerfdiff.checkpoint import check_resumable, export_model, last_checkpoint, load_model
+from nerfdiff.errors import CheckpointError, ConfigError
 from nerfdiff.modules.nerfdiff_module import NerfDiffModule
 
 log = logging.getLogger(__name__)
@@ -30,13 +30,14 @@ def train(cfg: DictConfig) -> dict[str, float]:
     Raises:
         UserError: bad data, config, checkpoint, or a run that diverged; the message says what to do.
     """
-    # Seeds the initial weights. All other randomness is a function of cfg.seed and the draw (nerfdiff.randomness).
+    # Seeds the initial weights, and dropout where a model has it. All other randomness is a function of cfg.seed and
+    # the draw (nerfdiff.randomness), which a resumed run takes up where it was.
     seed_everything(cfg.seed, verbose=False)
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
     output_dir = Path(cfg.paths.output_dir)
     model_config = plain(cfg.model) | {"conditioning": plain(cfg.conditioning)}
-    last = _checkpoint_to_resume(output_dir, cfg.resume, model_config)
+    last = _checkpoint_to_resume(output_dir, cfg, model_config)
 
     trainer = build_trainer(cfg)
     module = NerfDiffModule(
@@ -56,8 +57,10 @@ def train(cfg: DictConfig) -> dict[str, float]:
     trainer.fit(module, datamodule, ckpt_path=last, weights_only=True)
 
     if trainer.is_global_zero:
-        # With the EMA callback, the module holds the averaged weights once `fit` is over.
-        path = export_model(module.model, model_config, output_dir / "model", torch.float32)
+        # From the file, not the module: resuming a run that is complete leaves raw weights in the module.
+        weights = "ema" if cfg.callbacks.get("ema") else "raw"
+        loaded = load_model(last_checkpoint(output_dir), weights, cfg.paths.assets_dir)
+        path = export_model(loaded, output_dir / "model", torch.float32)
         log.info("weights: %s", path)
         log.info("previews: %s   curves: tensorboard --logdir %s", output_dir / "previews", output_dir)
     return {name: float(value) for name, value in trainer.callback_metrics.items()}
@@ -68,18 +71,22 @@ def build_trainer(cfg: DictConfig) -> Trainer:
     options: dict[str, Any] = {}
     if cfg.trainer.precision == "auto":
         options["precision"] = auto_precision(cfg.trainer.accelerator)
-    if cfg.logger is not None:
-        options["logger"] = instantiate(cfg.logger)
-    callbacks = [instantiate(callback) for callback in cfg.callbacks.values() if callback is not None]
-    return instantiate(
-        cfg.trainer,
-        callbacks=callbacks,
-        plugins=[ClearCheckpointIO()],
-        # Lightning counts batches where we count optimizer steps.
-        val_check_interval=cfg.validation_every * cfg.trainer.accumulate_grad_batches,
-        check_val_every_n_epoch=None,
-        **options,
-    )
+    logger = cfg.get("logger")
+    # Without a logger there is nowhere to write the learning rate to.
+    wanted = {name: node for name, node in cfg.callbacks.items() if logger or name != "learning_rate"}
+    try:
+        return instantiate(
+            cfg.trainer,
+            logger=instantiate(logger) if logger else False,
+            callbacks=[instantiate(callback) for callback in wanted.values() if callback is not None],
+            plugins=[ClearCheckpointIO()],
+            # Lightning counts batches where we count optimizer steps.
+            val_check_interval=cfg.validation_every * cfg.trainer.accumulate_grad_batches,
+            check_val_every_n_epoch=None,
+            **options,
+        )
+    except InstantiationException as error:
+        raise ConfigError(f"the trainer cannot be set up: {error.__cause__ or error}") from error
 
 
 def auto_precision(accelerator: str) -> str:
@@ -93,16 +100,16 @@ def plain(node: Any) -> Any:
     return OmegaConf.to_container(node, resolve=True)
 
 
-def _checkpoint_to_resume(output_dir: Path, resume: bool, model_config: dict) -> Path | None:
-    last = find_last(output_dir)
-    if last is None:
+def _checkpoint_to_resume(output_dir: Path, cfg: DictConfig, model_config: dict) -> Path | None:
+    last = last_checkpoint(output_dir)
+    if not last.is_file():
         return None
-    if not resume:
+    if not cfg.resume:
         raise CheckpointError(
             f"{output_dir} holds the checkpoint of an earlier run and resume=false: choose another run_name, or "
             "delete that folder"
         )
-    check_resumable(last, model_config)
+    check_resumable(last, model_config, cfg.trainer.accumulate_grad_batches)
     return last
 
 
@@ -117,5 +124,4 @@ def _announce(module: NerfDiffModule, last: Path | None) -> None:
         *(counts[part] / 1e6 for part in ("total", "encoder", "denoiser")),
         state,
     )
-    log.info("disk free: %.1f GiB", shutil.disk_usage(".").free / 2**30)
     log.info("resuming from %s", last) if last else log.info("starting afresh")

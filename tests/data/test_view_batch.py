@@ -56,7 +56,7 @@ def test_collating_joins_samples_in_order(reader):
 
 def test_batches_of_several_image_sizes_are_refused(reader):
     small = SRNReader(reader.folder.parent, "cars", "train", NEAR, FAR, image_size=[20, 28])
-    with pytest.raises(ValueError, match=r"one size.*\(20, 28\), \(40, 56\).*data\.image_size"):
+    with pytest.raises(DataError, match=r"one size.*\(20, 28\), \(40, 56\).*data\.image_size"):
         ViewBatch.collate([Sample(reader.load(0), 0, [1], 0), Sample(small.load(1), 0, [1], 1)])
 
 

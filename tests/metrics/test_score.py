@@ -33,6 +33,9 @@ class Reader:
     def __len__(self):
         return len(self.levels)
 
+    def fingerprint(self):
+        return str(self.levels)
+
     def scene_id(self, index):
         return list(self.levels)[index]
 

@@ -1,16 +1,17 @@
 """Checkpoints a run can be resumed from, written so that a failure never costs the one before."""
 
-import os
 import shutil
 from pathlib import Path
 from typing import Any
 
+import torch
 from lightning import LightningModule, Trainer
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
-from nerfdiff.errors import CheckpointError
+from nerfdiff.errors import CheckpointError, DataError
+from nerfdiff.results.files import atomic
 
 
 class LastCheckpoint(ModelCheckpoint):
@@ -62,18 +63,22 @@ class LastCheckpoint(ModelCheckpoint):
 
 
 class ClearCheckpointIO(TorchCheckpointIO):
-    """Lightning's atomic checkpoint files, with a clear word when one cannot be written.
+    """Checkpoint files that are whole or absent, with a clear word when one cannot be written.
+
+    Lightning's own writes to the system's temporary folder first, which may be another disk.
 
     Raises:
         CheckpointError: the file cannot be written; the checkpoint it was to replace is untouched.
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path, storage_options: Any = None) -> None:
+        path = Path(path)
         try:
-            super().save_checkpoint(checkpoint, path, storage_options)
-        except OSError as error:
-            free = shutil.disk_usage(os.path.dirname(path)).free
+            with atomic(path) as temporary:
+                torch.save(checkpoint, temporary)
+        except (OSError, RuntimeError, DataError) as error:  # torch turns a failed write into a RuntimeError
+            free = shutil.disk_usage(path.parent).free
             raise CheckpointError(
-                f"cannot write {path}: {error.strerror or error} ({free / 2**20:.0f} MiB free). The checkpoint "
+                f"cannot write {path}: {str(error).splitlines()[0]} ({free / 2**20:.0f} MiB free). The checkpoint "
                 "before it is kept: free some space and run the same command again to go on from there"
             ) from error

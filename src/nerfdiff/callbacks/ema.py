@@ -23,20 +23,22 @@ class EMA(WeightAveraging):
     """
 
     def __init__(self, decay: float, warmup: int):
-        def average(averaged: Tensor, current: Tensor, n: Tensor | int) -> Tensor:
-            rate = min(decay, (1 + int(n)) / (warmup + int(n)))
-            return torch.lerp(current, averaged, rate)
+        def average(averaged: list[Tensor], current: list[Tensor], n: Tensor | int) -> None:
+            n = int(n)  # one wait for the GPU for all parameters together
+            torch._foreach_lerp_(averaged, current, 1 - min(decay, (1 + n) / (warmup + n)))
 
-        super().__init__(avg_fn=average)
+        super().__init__(multi_avg_fn=average)
         self._swapped = False
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        super().on_validation_epoch_start(trainer, pl_module)
-        self._swapped = self._average_model is not None
+        if trainer.state.fn == TrainerFn.FITTING:  # else the weights to validate are those that were loaded
+            super().on_validation_epoch_start(trainer, pl_module)
+            self._swapped = True
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        super().on_validation_epoch_end(trainer, pl_module)
-        self._swapped = False
+        if self._swapped:
+            super().on_validation_epoch_end(trainer, pl_module)
+            self._swapped = False
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         if self._swapped:

@@ -11,7 +11,6 @@ from torch import Tensor
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.cdm import IndependentViews
 from nerfdiff.model import NerfDiff
-from nerfdiff.randomness import generator
 from nerfdiff.results.pictures import colour_depth, contact_sheet
 
 
@@ -34,8 +33,8 @@ class Previews(Callback):
         self, trainer, pl_module, outputs, batch: ViewBatch, batch_idx: int, dataloader_idx: int = 0
     ) -> None:
         if trainer.is_global_zero and not trainer.sanity_checking and batch_idx < self.scenes:
-            noise = generator(pl_module.device, pl_module.hparams.seed, "preview", batch_idx)
-            self._shown.append(self._pictures(pl_module.model, batch, noise))
+            with trainer.precision_plugin.forward_context():
+                self._shown.append(self._pictures(pl_module.model, batch, pl_module.hparams.seed))
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not self._shown:
@@ -50,7 +49,7 @@ class Previews(Callback):
 
     @torch.no_grad()
     def _pictures(
-        self, model: NerfDiff, batch: ViewBatch, noise: torch.Generator
+        self, model: NerfDiff, batch: ViewBatch, seed: int
     ) -> dict[str, Float[Tensor, "views 3 height width"]]:
         encoding = model.encode(batch.source, batch.source_cameras, batch.near, batch.far)
         rendering = model.render(encoding, batch.target_cameras)
@@ -59,7 +58,7 @@ class Previews(Callback):
             "input": batch.source.expand_as(batch.targets[0]),
             "render": rendering.rgb[0].movedim(-1, 1),
             "depth": colour_depth(rendering.depth[0], near, far, rendering.opacity[0]),
-            "cdm": self.sampler.sample(model, encoding, batch.target_cameras, noise)[0],
+            "cdm": self.sampler.sample(model, encoding, batch.target_cameras, (seed, "preview", *batch.scene_ids))[0],
             "truth": batch.targets[0],
         }
         return {name: images.float().cpu() for name, images in pictures.items()}

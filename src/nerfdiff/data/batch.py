@@ -9,6 +9,7 @@ from torch import Tensor
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.scene import Scene
+from nerfdiff.errors import DataError
 
 
 @dataclass(frozen=True)
@@ -60,12 +61,13 @@ class ViewBatch:
         """Batch samples, and put their cameras into the space of their sources.
 
         Raises:
-            ValueError: image sizes, or the numbers of targets, differ.
+            DataError: image sizes differ.
+            RuntimeError: the numbers of targets differ.
         """
         scenes = [sample.scene for sample in samples]
         sizes = {tuple(scene.pixels.shape[-2:]) for scene in scenes}
         if len(sizes) > 1:
-            raise ValueError(f"scenes of a batch need images of one size, not {sorted(sizes)}; set data.image_size")
+            raise DataError(f"scenes of a batch need images of one size, not {sorted(sizes)}; set data.image_size")
         sources = Cameras.stack([sample.scene.cameras[sample.source] for sample in samples])
         targets = Cameras.stack([sample.scene.cameras[list(sample.targets)] for sample in samples])
 

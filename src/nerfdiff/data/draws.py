@@ -9,19 +9,19 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Int64, UInt64
 from torch.utils.data import Sampler
 
 SCENE_ORDER, VIEWS = 0, 1  # streams of random numbers that must not meet
 
 
-def random_bits(seed: int, stream: int, counter: int, count: int) -> Int[np.ndarray, " count"]:
+def random_bits(seed: int, stream: int, counter: int, count: int) -> UInt64[np.ndarray, "{count}"]:
     """`count` random uint64 that depend on the three numbers alone (Salmon et al. 2011, Philox)."""
     return np.random.Philox(key=[seed, stream], counter=[0, counter, 0, 0]).random_raw(count)
 
 
 @lru_cache(maxsize=4)
-def scene_order(seed: int, epoch: int, scenes: int) -> Int[np.ndarray, " scenes"]:
+def scene_order(seed: int, epoch: int, scenes: int) -> Int64[np.ndarray, "{scenes}"]:
     """The shuffled order in which pass `epoch` over the dataset visits its scenes."""
     return np.argsort(random_bits(seed, SCENE_ORDER, epoch, scenes), kind="stable")
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
@@ -44,6 +44,7 @@ class Scene:
         return self.pixels.float() / 255
 
 
+@runtime_checkable
 class SceneReader(Protocol):
     """One split of one dataset: an ordered collection of scenes read lazily from disk."""
 

@@ -7,7 +7,7 @@ Poses are camera-to-world with OpenCV axes in a z-up world, so nothing needs con
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
@@ -226,7 +226,7 @@ def _read_depth(path: Path) -> Float[np.ndarray, "height width"]:
     return depth
 
 
-def _some(names: Sequence[str], limit: int = 8) -> str:
+def _some(names: Collection[str], limit: int = 8) -> str:
     names = sorted(names)
     more = f" and {len(names) - limit} more" if len(names) > limit else ""
     return (", ".join(names[:limit]) or "none") + more

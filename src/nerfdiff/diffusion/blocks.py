@@ -49,7 +49,9 @@ class ResBlock(nn.Module):
         self.conv_out = zero(nn.Conv2d(out_channels, out_channels, 3, padding=1))
         self.skip = nn.Identity() if channels == out_channels else nn.Conv2d(channels, out_channels, 1)
 
-    def forward(self, x: Features, embedding: Float[Tensor, "batch embedding"] | None) -> Features:
+    def forward(
+        self, x: Features, embedding: Float[Tensor, "batch embedding"] | None
+    ) -> Float[Tensor, "batch out_channels height width"]:
         h = self.conv_in(F.silu(self.norm_in(x)))
         h = self.norm_out(h)
         if self.embed is not None:
@@ -90,7 +92,7 @@ class Downsample(nn.Module):
         super().__init__()
         self.conv = nn.Conv2d(channels, channels, 3, stride=2, padding=1)
 
-    def forward(self, x: Features) -> Features:
+    def forward(self, x: Features) -> Float[Tensor, "batch channels (height+1)//2 (width+1)//2"]:
         return self.conv(x)
 
 
@@ -102,5 +104,5 @@ class Upsample(nn.Module):
         super().__init__()
         self.conv = nn.Conv2d(channels, channels, 3, padding=1)
 
-    def forward(self, x: Features, size: tuple[int, int]) -> Features:
+    def forward(self, x: Features, size: tuple[int, int]) -> Float[Tensor, "batch channels {size[0]} {size[1]}"]:
         return self.conv(F.interpolate(x, size=size, mode="nearest"))

@@ -12,7 +12,7 @@ from nerfdiff.diffusion.schedule import alpha_sigma, eps_from_x0
 Images = Float[Tensor, "batch 3 height width"]
 
 
-def time_steps(n: int, t_max: float, t_min: float, device=None) -> Float[Tensor, "n+1"]:
+def time_steps(n: int, t_max: float, t_min: float, device=None) -> Float[Tensor, "{n}+1"]:
     """n + 1 evenly spaced times from t_max down to t_min.
 
     Raises:
@@ -44,9 +44,9 @@ def ddim_step(z: Images, x0: Images, t: Tensor, t_next: Tensor, eta: float, nois
 def ddim_sample(
     denoise: Callable[[Images, Tensor], Images],
     z: Images,
-    times: Float[Tensor, "steps+1"],
+    times: Float[Tensor, "times"],
     eta: float = 0.0,
-    generator: torch.Generator | None = None,
+    noise: Callable[[], Images] | None = None,
     on_x0: Callable[[Images, Tensor], Images] | None = None,
 ) -> Images:
     """Follow the reverse process along `times` and return the last denoised images.
@@ -54,6 +54,8 @@ def ddim_sample(
     Args:
         denoise: (Z_t, t as a scalar) to x0.
         z: the noise at times[0].
+        times: descending, one more than there are steps.
+        noise: makes fresh standard normal images; needed where eta > 0.
         on_x0: called with every (x0, t); what it returns takes x0's place: the hook for guidance and previews.
 
     Returns:
@@ -63,6 +65,5 @@ def ddim_sample(
         x0 = denoise(z, t)
         if on_x0 is not None:
             x0 = on_x0(x0, t)
-        noise = torch.randn(z.shape, generator=generator, dtype=z.dtype, device=z.device) if eta > 0 else None
-        z = ddim_step(z, x0, t, t_next, eta, noise)
+        z = ddim_step(z, x0, t, t_next, eta, noise() if eta > 0 else None)
     return x0

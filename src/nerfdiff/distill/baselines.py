@@ -10,6 +10,7 @@ from torch import Tensor
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.distill.strategy import Views
+from nerfdiff.model import NerfDiff
 from nerfdiff.randomness import generator
 
 
@@ -19,7 +20,7 @@ class CopyInput:
 
     name: str = "copy_input"
 
-    def predict(self, model: None, scene: ViewBatch, seed: int) -> Views:
+    def predict(self, model: NerfDiff | None, scene: ViewBatch, seed: int) -> Views:
         return Views(scene.source.expand(scene.targets.shape[1], -1, -1, -1))
 
 
@@ -30,7 +31,7 @@ class MeanImage:
     mean: Float[Tensor, "3 height width"]
     name: str = "mean_image"
 
-    def predict(self, model: None, scene: ViewBatch, seed: int) -> Views:
+    def predict(self, model: NerfDiff | None, scene: ViewBatch, seed: int) -> Views:
         mean = F.interpolate(self.mean[None], scene.targets.shape[-2:], mode="area")
         return Views(mean.expand(scene.targets.shape[1], -1, -1, -1).to(scene.source))
 

@@ -1,6 +1,7 @@
 """Strategy `cdm`: every view sampled from the CDM by itself ("Ours (CDM)" in the paper's figures)."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -36,13 +37,7 @@ class IndependentViews:
     @torch.no_grad()
     def predict(self, model: NerfDiff, scene: ViewBatch, seed: int) -> Views:
         encoding = model.encode(scene.source, scene.source_cameras, scene.near, scene.far)
-        images = []
-        cameras = scene.target_cameras
-        for start in range(0, cameras.shape[1], self.views_at_once):
-            chunk = cameras[:, start : start + self.views_at_once]
-            noise = generator(scene.source.device, seed, "cdm", scene.scene_ids[0], start)
-            images.append(self.sample(model, encoding, chunk, noise)[0])
-        images = torch.cat(images)
+        images = self.sample(model, encoding, scene.target_cameras, (seed, "cdm", *scene.scene_ids))[0]
         return Views(
             images=images,
             denoiser_calls=self.steps * len(images),
@@ -51,11 +46,25 @@ class IndependentViews:
 
     @torch.no_grad()
     def sample(
-        self, model: NerfDiff, encoding: Encoding, cameras: Cameras, noise: torch.Generator
-    ) -> Float[Tensor, "batch views 3 height width"]:
-        """Images in [0, 1] of `cameras` [batch, views], given in the input cameras' space."""
-        condition = model.condition(encoding, cameras, model.render(encoding, cameras))
-        z = torch.randn(condition.rendered.shape, generator=noise, device=noise.device)
-        times = time_steps(self.steps, self.t_max, self.t_min, device=z.device)
-        x0 = ddim_sample(lambda z, t: model.denoise(z, t, condition), z, times, self.eta, noise)
-        return (0.5 * (x0 + 1)).clamp(0, 1).unflatten(0, cameras.shape)
+        self, model: NerfDiff, encoding: Encoding, cameras: Cameras, seed: tuple[int | str, ...]
+    ) -> Float[Tensor, "1 views 3 height width"]:
+        """Images in [0, 1] of `cameras` [1, views], given in the input camera's space.
+
+        Args:
+            seed: a view's noise depends on it and on the view's position, not on what is sampled beside it.
+        """
+        device = encoding.source.device
+        times = time_steps(self.steps, self.t_max, self.t_min, device=device)
+        images = []
+        for start in range(0, cameras.shape[1], self.views_at_once):
+            chunk = cameras[:, start : start + self.views_at_once]
+            condition = model.condition(encoding, chunk, model.render(encoding, chunk))
+            sources = [generator(device, *seed, start + view) for view in range(chunk.shape[1])]
+            noise = partial(_noise, sources, condition.rendered.shape[1:])
+            x0 = ddim_sample(lambda z, t, c=condition: model.denoise(z, t, c), noise(), times, self.eta, noise)
+            images.append((0.5 * (x0 + 1)).clamp(0, 1))
+        return torch.cat(images)[None]
+
+
+def _noise(sources: list[torch.Generator], shape: torch.Size) -> Float[Tensor, "views 3 height width"]:
+    return torch.stack([torch.randn(shape, generator=source, device=source.device) for source in sources])

@@ -1,7 +1,7 @@
 """What a test-time method is: one input image and a trained model to images of other views."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -29,6 +29,7 @@ class Views:
     field_queries: int = 0
 
 
+@runtime_checkable
 class Strategy(Protocol):
     """A test-time method. `name` is what results call it."""
 

@@ -1,7 +1,7 @@
 """The image encoder e_ψ: one image to a camera-aligned triplane, and features for the CDM to attend to."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -24,24 +24,6 @@ class Encoding:
     source: Float[Tensor, "batch 3 height width"]
     triplane: Triplane
     features: list[Float[Tensor, "batch _c _h _w"]]
-
-    def repeat(self, n: int) -> "Encoding":
-        """Each scene n times in a row, to go with n views per scene flattened into the batch axis."""
-        t = self.triplane
-        triplane = replace(
-            t,
-            planes=t.planes.repeat_interleave(n, 0),
-            cameras=Cameras(
-                t.cameras.c2w.repeat_interleave(n, 0),
-                t.cameras.K.repeat_interleave(n, 0),
-                t.cameras.height,
-                t.cameras.width,
-            ),
-            near=t.near.repeat_interleave(n),
-            far=t.far.repeat_interleave(n),
-        )
-        features = [f.repeat_interleave(n, 0) for f in self.features]
-        return Encoding(self.source.repeat_interleave(n, 0), triplane, features)
 
 
 class Encoder(nn.Module):

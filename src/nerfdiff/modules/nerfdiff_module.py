@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.diffusion.schedule import add_noise, alpha_sigma, expand, v_from_x0_eps
+from nerfdiff.errors import ConfigError
 from nerfdiff.metrics.image import psnr
 from nerfdiff.model import NerfDiff
 from nerfdiff.randomness import generator, spread_times
@@ -41,10 +43,12 @@ class NerfDiffModule(LightningModule):
         super().__init__()
         self.save_hyperparameters()
         self.model = NerfDiff(**model)
+        self.image_size: list[int] | None = None  # of the training images, once one was seen
         if channels_last:
             self.model.to(memory_format=torch.channels_last)
 
     def training_step(self, batch: ViewBatch, batch_idx: int) -> Tensor:
+        self.image_size = list(batch.targets.shape[-2:])
         noise = self._noise(batch)
         times = spread_times(batch.draws, self.hparams.seed)
         loss_ic, loss_dm = self._losses(batch, times, **noise)
@@ -79,6 +83,9 @@ class NerfDiffModule(LightningModule):
     def configure_optimizers(self) -> dict:
         options = dict(self.hparams.optimizer)
         warmup, decay = options.pop("warmup_steps"), options.pop("decay")
+        if decay not in ("none", "cosine"):
+            raise ConfigError(f"optimizer.decay must be none or cosine, got {decay!r}")
+        options["betas"] = tuple(options["betas"])
         optimizer = torch.optim.AdamW(self.model.parameters(), **options)
         total = self.trainer.max_steps
 
@@ -89,6 +96,20 @@ class NerfDiffModule(LightningModule):
 
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def on_train_start(self) -> None:
+        """A resumed run follows the settings it is given, where Lightning has just restored the old ones."""
+        (scheduler,) = (config.scheduler for config in self.trainer.lr_scheduler_configs)
+        options = self.hparams.optimizer
+        scheduler.base_lrs = [options["lr"] for _ in scheduler.base_lrs]
+        for group, factor in zip(scheduler.optimizer.param_groups, scheduler.lr_lambdas, strict=True):
+            group["initial_lr"], group["lr"] = options["lr"], options["lr"] * factor(scheduler.last_epoch)
+            group["weight_decay"], group["betas"] = options["weight_decay"], tuple(options["betas"])
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """What a person has to keep the same to resume, or to use the model well."""
+        checkpoint["accumulate_grad_batches"] = self.trainer.accumulate_grad_batches
+        checkpoint["image_size"] = self.image_size
 
     def _losses(self, batch: ViewBatch, times: Tensor, jitter: Tensor, eps: Tensor) -> tuple[Tensor, Tensor]:
         """(L^IC, L^DM) of the paper's eqs. "pixelnerf" and "ddpm", the latter on v."""

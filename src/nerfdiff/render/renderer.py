@@ -36,7 +36,7 @@ class Renderer:
         uniform_samples, importance_samples: per ray; the paper uses 64 and 64.
         background: grey level behind everything (1 is white).
         chunk: points per evaluation of the field at most. Under autograd each chunk is recomputed in the backward
-            pass, so memory is O(chunk) whatever the number of rays and samples.
+            pass, so what is kept, beside the rays themselves, is O(chunk) whatever the number of samples.
     """
 
     uniform_samples: int
@@ -103,9 +103,8 @@ class Renderer:
         rgb, density = self._query(field, rays, distances)
         if self.importance_samples > 0:
             with torch.no_grad():
-                lengths = edges_between(distances, near, far).diff(dim=-1)
-                weights = compositing_weights(density, lengths)
                 bins = edges_between(distances, near, far)
+                weights = compositing_weights(density, bins.diff(dim=-1))
                 drawn = importance_distances(bins, weights, self.importance_samples, importance_jitter)
             rgb_drawn, density_drawn = self._query(field, rays, drawn)
             distances, order = torch.cat([distances, drawn], -1).sort(-1)

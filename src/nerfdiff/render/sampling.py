@@ -7,28 +7,34 @@ from torch import Tensor
 from nerfdiff.precision import at_least_single
 
 
-def uniform_edges(near: Float[Tensor, "*rays"], far: Float[Tensor, "*rays"], n: int) -> Float[Tensor, "*rays n+1"]:
-    """Edges of n equal bins between near and far."""
+def uniform_edges(near: Float[Tensor, "*rays"], far: Float[Tensor, "*rays"], n: int) -> Float[Tensor, "*rays {n}+1"]:
+    """The n + 1 edges of n equal bins between near and far."""
     steps = torch.linspace(0, 1, n + 1, dtype=near.dtype, device=near.device)
     return near[..., None] + (far - near)[..., None] * steps
 
 
-def in_bins(edges: Float[Tensor, "*rays n+1"], jitter: Float[Tensor, "*rays n"] | None) -> Float[Tensor, "*rays n"]:
-    """One distance per bin: its centre, or the place `jitter` in [0, 1) picks (stratified sampling)."""
+def in_bins(
+    edges: Float[Tensor, "*rays edges"], jitter: Float[Tensor, "*rays edges-1"] | None
+) -> Float[Tensor, "*rays edges-1"]:
+    """One distance per bin: its centre, or the place `jitter` in [0, 1) picks (stratified sampling).
+
+    n bins have n + 1 edges.
+    """
     offset = 0.5 if jitter is None else jitter
     return edges[..., :-1] + offset * edges.diff(dim=-1)
 
 
 def importance_distances(
-    edges: Float[Tensor, "*rays n+1"],
-    weights: Float[Tensor, "*rays n"],
+    edges: Float[Tensor, "*rays edges"],
+    weights: Float[Tensor, "*rays edges-1"],
     n: int,
-    jitter: Float[Tensor, "*rays m"] | None,
+    jitter: Float[Tensor, "*rays {n}"] | None,
     floor: float = 1e-2,
-) -> Float[Tensor, "*rays m"]:
+) -> Float[Tensor, "*rays {n}"]:
     """n distances drawn by inverse CDF from the piecewise-constant density `weights` over the bins.
 
     Args:
+        edges, weights: one edge more than there are bins, and so weights.
         jitter: in [0, 1), one per drawn distance; None takes the n quantile centres.
         floor: share of the draws spread evenly over all bins, so that a ray that met nothing (all weights zero)
             is sampled evenly and no bin is never looked at.

@@ -91,7 +91,7 @@ def contact_sheet(
     return path
 
 
-def orbit_video(path: str | Path, frames: Float[Tensor, "n 3 h w"], fps: float = 25.0, min_size: int = 256) -> Path:
+def orbit_video(path: str | Path, frames: Float[Tensor, "n 3 h w"], fps: int | float = 25, min_size: int = 256) -> Path:
     """Save frames in [0, 1] as an H.264 mp4 that any player shows (yuv420p).
 
     Frames smaller than `min_size` pixels are enlarged by a whole factor (pixels stay squares); a last odd row

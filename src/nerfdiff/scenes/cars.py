@@ -55,7 +55,7 @@ def body(p: Proportions, colour: Colour) -> Part:
     return loft("body", rings, colour, "paint")
 
 
-def build_car(rng: np.random.Generator, styles: Mapping[str, float]) -> Model:
+def build_car(rng: np.random.Generator, styles: Mapping[str, int | float]) -> Model:
     """One car, normalised to the unit diagonal and facing −y.
 
     Args:

@@ -9,10 +9,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from nerfdiff.scenes.mesh import Colour, Part, box, slab, tube
+from nerfdiff.scenes.mesh import Colour, Numbers, Part, Point, box, slab, tube
 from nerfdiff.scenes.paint import jitter, pick
 
-WOODS: dict[str, tuple[float, Colour]] = {
+WOODS: dict[str, tuple[int, Colour]] = {
     "beech": (4, (0.80, 0.64, 0.44)),
     "oak": (5, (0.66, 0.47, 0.28)),
     "cherry": (3, (0.55, 0.27, 0.15)),
@@ -22,13 +22,13 @@ WOODS: dict[str, tuple[float, Colour]] = {
     "green": (1, (0.24, 0.42, 0.32)),
     "blue": (1, (0.20, 0.34, 0.52)),
 }
-METALS: dict[str, tuple[float, Colour]] = {
+METALS: dict[str, tuple[int, Colour]] = {
     "chrome": (5, (0.70, 0.71, 0.73)),
     "black": (4, (0.10, 0.10, 0.11)),
     "white": (2, (0.90, 0.90, 0.90)),
     "brass": (1, (0.75, 0.58, 0.26)),
 }
-FABRICS: dict[str, tuple[float, Colour]] = {
+FABRICS: dict[str, tuple[int, Colour]] = {
     "red": (4, (0.72, 0.12, 0.12)),
     "wine": (2, (0.42, 0.08, 0.14)),
     "orange": (3, (0.90, 0.46, 0.12)),
@@ -47,7 +47,7 @@ FABRICS: dict[str, tuple[float, Colour]] = {
 }
 
 
-def draw_colour(rng: np.random.Generator, palette: dict[str, tuple[float, Colour]]) -> Colour:
+def draw_colour(rng: np.random.Generator, palette: dict[str, tuple[int, Colour]]) -> Colour:
     """A colour of `palette`, drawn by weight and varied slightly."""
     return jitter(rng, palette[pick(rng, {name: weight for name, (weight, _) in palette.items()})][1])
 
@@ -84,8 +84,8 @@ def draw_seat(rng: np.random.Generator, **ranges: tuple[float, float]) -> Seat:
 
 def bar(
     name: str,
-    start: Sequence[float],
-    end: Sequence[float],
+    start: Point,
+    end: Point,
     thickness: float,
     colour: Colour,
     round_: bool = True,
@@ -97,9 +97,7 @@ def bar(
     return tube(name, start, end, [radius, radius * taper], colour, finish, segments=10 if round_ else 4)
 
 
-def pipe(
-    name: str, points: Sequence[Sequence[float]], thickness: float, colour: Colour, finish: str = "paint"
-) -> list[Part]:
+def pipe(name: str, points: Sequence[Point], thickness: float, colour: Colour, finish: str = "paint") -> list[Part]:
     """A bent round bar through `points`; the pieces overlap so that the bends are filled."""
     parts = []
     for a, b in pairwise(points):
@@ -111,8 +109,8 @@ def pipe(
 
 def sheet(
     name: str,
-    path: Sequence[tuple[float, float]],
-    half_widths: Sequence[float],
+    path: Sequence[tuple[int | float, int | float]],
+    half_widths: Numbers,
     thickness: float,
     colour: Colour,
     bowl: float = 0.0,

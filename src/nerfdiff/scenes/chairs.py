@@ -19,7 +19,7 @@ STYLES: dict[str, Callable[[np.random.Generator], list[Part]]] = {
 }
 
 
-def build_chair(rng: np.random.Generator, styles: Mapping[str, float]) -> Model:
+def build_chair(rng: np.random.Generator, styles: Mapping[str, int | float]) -> Model:
     """One chair, normalised to the unit diagonal and facing −y.
 
     Args:

@@ -22,7 +22,7 @@ def contact_sheet(folders: Sequence[Path], scenes: int, views: int) -> UInt8[np.
     return np.concatenate(strips)
 
 
-def _occupied(images: Sequence[UInt8[np.ndarray, "size size 3"]]) -> tuple[int, int]:
+def _occupied(images: Sequence[UInt8[np.ndarray, "size size 3"]]) -> tuple[int | np.integer, int | np.integer]:
     """The central square outside which every image is white, as a range of rows and columns."""
     size = images[0].shape[0]
     drawn = np.any([(image < 255).any(axis=-1) for image in images], axis=0)

@@ -8,9 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Real
 
 Colour = tuple[float, float, float]
+Point = Sequence[int | float] | Real[np.ndarray, "3"]
+Numbers = Sequence[int | float] | Real[np.ndarray, "numbers"]
 FINISHES = ("matte", "paint", "glass")
 
 
@@ -70,7 +72,7 @@ class Model:
         return tuple(part for part in self.parts if part.name == name)
 
 
-def loft(name: str, rings: Float[np.ndarray, "rings points 3"], colour: Colour, finish: str = "matte") -> Part:
+def loft(name: str, rings: Real[np.ndarray, "rings points 3"], colour: Colour, finish: str = "matte") -> Part:
     """A closed surface through consecutive rings; the first and last one, both convex, are capped."""
     count, points = rings.shape[:2]
     vertices = rings.reshape(-1, 3).astype(np.float64)
@@ -89,11 +91,11 @@ def loft(name: str, rings: Float[np.ndarray, "rings points 3"], colour: Colour, 
 
 def box(
     name: str,
-    centre: Sequence[float],
-    size: Sequence[float],
+    centre: Point,
+    size: Point,
     colour: Colour,
     finish: str = "matte",
-    bevel: float = 0.0,
+    bevel: int | float = 0.0,
 ) -> Part:
     """An axis-aligned box whose edges are cut off by `bevel` (limited to a third of the shortest side)."""
     half = np.asarray(size, np.float64) / 2
@@ -105,7 +107,9 @@ def box(
     return loft(name, rings + np.asarray(centre, np.float64), colour, finish)
 
 
-def chamfered_rectangle(half_x: float, half_y: float, cut: float, z: float) -> Float[np.ndarray, "points 3"]:
+def chamfered_rectangle(
+    half_x: int | float, half_y: int | float, cut: int | float, z: int | float
+) -> Real[np.ndarray, "points 3"]:
     """A horizontal rectangle around the z axis with its corners cut off (four points where `cut` is 0)."""
     if cut == 0:
         corners = [(-half_x, -half_y), (half_x, -half_y), (half_x, half_y), (-half_x, half_y)]
@@ -118,13 +122,13 @@ def chamfered_rectangle(half_x: float, half_y: float, cut: float, z: float) -> F
 
 def tube(
     name: str,
-    start: Sequence[float],
-    end: Sequence[float],
-    radii: Sequence[float],
+    start: Point,
+    end: Point,
+    radii: Numbers,
     colour: Colour,
     finish: str = "matte",
     segments: int = 12,
-    positions: Sequence[float] | None = None,
+    positions: Numbers | None = None,
 ) -> Part:
     """A round bar from `start` to `end` with these radii at `positions` (in [0, 1], even by default)."""
     start, end = np.asarray(start, np.float64), np.asarray(end, np.float64)
@@ -142,7 +146,7 @@ def tube(
 
 def panel(
     name: str,
-    corners: Float[np.ndarray, "corners 3"],
+    corners: Real[np.ndarray, "corners 3"],
     colour: Colour,
     finish: str = "matte",
     thickness: float = 0.02,
@@ -160,8 +164,8 @@ def panel(
 
 def slab(
     name: str,
-    upper: Float[np.ndarray, "rows columns 3"],
-    lower: Float[np.ndarray, "rows columns 3"],
+    upper: Real[np.ndarray, "rows columns 3"],
+    lower: Real[np.ndarray, "rows columns 3"],
     colour: Colour,
     finish: str = "matte",
 ) -> Part:

@@ -8,7 +8,7 @@ import numpy as np
 from nerfdiff.scenes.mesh import Colour
 
 # Shares roughly as seen on real roads, the rarer bright colours raised so that they are learnt as well.
-CAR_COLOURS: dict[str, tuple[float, Colour]] = {
+CAR_COLOURS: dict[str, tuple[int, Colour]] = {
     "white": (14, (0.92, 0.92, 0.91)),
     "black": (11, (0.09, 0.09, 0.10)),
     "graphite": (8, (0.30, 0.31, 0.33)),
@@ -32,7 +32,7 @@ CHROME: Colour = (0.68, 0.69, 0.70)
 GLASS: tuple[Colour, Colour] = ((0.13, 0.15, 0.17), (0.40, 0.45, 0.49))
 
 
-def pick(rng: np.random.Generator, weights: Mapping[str, float]) -> str:
+def pick(rng: np.random.Generator, weights: Mapping[str, int | float]) -> str:
     """One key, drawn with these weights."""
     names, shares = list(weights), np.array(list(weights.values()), np.float64)
     return names[rng.choice(len(names), p=shares / shares.sum())]

@@ -6,14 +6,14 @@ numpy in float64, so that workers that render need not load torch.
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Real
 
 # SRN's renders: 131.25 px at 128 × 128 with the principal point in the middle.
 FOCAL_PER_PIXEL = 131.25 / 128
 SPIRAL_VIEWS = 251
 
 
-def look_at_origin(centre: Sequence[float]) -> Float[np.ndarray, "4 4"]:
+def look_at_origin(centre: Sequence[int | float] | Real[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
     """cam2world of a camera at `centre` that looks at the origin, the world's z pointing up in the image.
 
     Straight above or below, where up is undefined, x is (−1, 0, 0): the limit SRN's own files hold.
@@ -29,7 +29,7 @@ def look_at_origin(centre: Sequence[float]) -> Float[np.ndarray, "4 4"]:
     return c2w
 
 
-def srn_spiral(radius: float, views: int = SPIRAL_VIEWS) -> Float[np.ndarray, "views 4 4"]:
+def srn_spiral(radius: int | float, views: int = SPIRAL_VIEWS) -> Float[np.ndarray, "views 4 4"]:
     """The first `views` of the 251 test poses of SRN-ShapeNet, from the equator up to the pole."""
     k = np.arange(views)
     elevation, azimuth = np.deg2rad(0.36 * k), 20 - 0.08 * k
@@ -39,7 +39,10 @@ def srn_spiral(radius: float, views: int = SPIRAL_VIEWS) -> Float[np.ndarray, "v
 
 
 def random_sphere(
-    radius: float, views: int, rng: np.random.Generator, elevation: tuple[float, float] = (-90.0, 90.0)
+    radius: int | float,
+    views: int,
+    rng: np.random.Generator,
+    elevation: tuple[int | float, int | float] = (-90.0, 90.0),
 ) -> Float[np.ndarray, "views 4 4"]:
     """Poses uniform on the sphere between two elevations in degrees; SRN's training views are on all of it."""
     low, high = np.sin(np.radians(elevation))

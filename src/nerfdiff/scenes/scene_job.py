@@ -35,9 +35,9 @@ class SceneJob:
     index: int
     views: int
     seed: int
-    radius: float
-    elevation: tuple[float, float]
-    styles: Mapping[str, float]
+    radius: int | float
+    elevation: tuple[int | float, int | float]
+    styles: Mapping[str, int | float]
 
     @property
     def folder(self) -> Path:

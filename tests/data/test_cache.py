@@ -177,12 +177,12 @@ def _build_and_digest(root, queue) -> None:
 
 
 def test_processes_may_build_at_once(root):
-    context = multiprocessing.get_context("fork")
+    context = multiprocessing.get_context("spawn")  # a fork of a process with OpenMP threads may hang
     queue = context.Queue()
-    processes = [context.Process(target=_build_and_digest, args=(root, queue)) for _ in range(3)]
+    processes = [context.Process(target=_build_and_digest, args=(root, queue), daemon=True) for _ in range(3)]
     for process in processes:
         process.start()
-    results = [queue.get(timeout=30) for _ in processes]
+    results = [queue.get(timeout=180) for _ in processes]
     for process in processes:
         process.join()
         assert process.exitcode == 0

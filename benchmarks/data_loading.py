@@ -89,6 +89,8 @@ def measure(arguments: argparse.Namespace, cache_dir: str) -> list[tuple[str, li
                 reader=make_reader,
                 target_views=1,
                 source_as_target=0.0,
+                source_target_noise=0.0,
+                background=1.0,
                 batch_size=arguments.batch_size,
                 val_source_view=0,
                 val_scenes=1,

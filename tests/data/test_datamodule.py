@@ -1,24 +1,21 @@
 """From files through config, cache, loader and trainer to batches."""
 
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from hydra.utils import instantiate
 from lightning import LightningModule, Trainer
-from omegaconf import OmegaConf
 
 from data_fixtures import COLOURS, FAR, NEAR, POINTS, project, visible, write_srn
+from nerfdiff.cli import load_config
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.cache import CachedReader
 from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.data.scene import MissingSplit
 from nerfdiff.data.srn import SRNReader
 from nerfdiff.errors import ConfigError, DataError
-
-CONF = Path(__file__).parents[2] / "conf" / "data"
 
 
 def datamodule(root, **changes) -> SceneDataModule:
@@ -31,6 +28,8 @@ def datamodule(root, **changes) -> SceneDataModule:
         "train_source_view": None,
         "target_views": 2,
         "source_as_target": 0.2,
+        "source_target_noise": 0.0,
+        "background": 1.0,
         "batch_size": 6,
         "val_source_view": 1,
         "val_scenes": 8,
@@ -264,12 +263,8 @@ def test_settings_the_trainer_cannot_meet(root):
 )
 def test_shipped_configs_make_working_data(tmp_path, name, category, near, far):
     write_srn(tmp_path / "data", views=66, scenes={"train": 1, "test": 1}, category=category)
-    config = OmegaConf.load(CONF / "srn_cars.yaml")
-    own = OmegaConf.load(CONF / f"{name}.yaml")
-    own.pop("defaults", None)
-    config = OmegaConf.create({"seed": 2, "data": OmegaConf.merge(config, own)})
-    config.data.root, config.data.cache_dir = str(tmp_path / "data"), str(tmp_path / "cache")
-    config.data.image_size = [32, 32]
+    folders = [f"data.root={tmp_path / 'data'}", f"data.cache_dir={tmp_path / 'cache'}"]
+    config = load_config("train", [f"data={name}", "seed=2", "data.image_size=[32,32]", *folders])
     data = instantiate(config.data)
     assert (data.name, data.seed, data.batch_size, data.splits["val"]) == (name, 2, 32, "val")
     data.setup("fit")

@@ -2,6 +2,7 @@
 
 from collections import Counter
 
+import numpy as np
 import pytest
 
 from nerfdiff.data.draws import Draws, DrawSampler, random_bits, scene_order
@@ -100,3 +101,15 @@ def test_a_fixed_source_is_never_its_own_target_unless_asked():
         assert source == 4 and 4 not in targets and len(set(targets)) == 3
         seen.update(targets)
     assert seen == {0, 1, 2, 3, 5}
+
+
+def test_the_shift_of_reconstructed_inputs_has_the_wanted_variance_and_depends_on_the_draw_alone():
+    draws = Draws(seed=5, scenes=7, target_views=1, source_as_target=0.5, source_target_noise=0.3)
+    shifts = np.array([draws.shift(draw) for draw in range(4000)])
+    assert np.abs(shifts.mean(0)).max() < 0.03
+    np.testing.assert_allclose(np.cov(shifts.T), 0.3 * np.eye(3), atol=0.03)
+    assert draws.shift(17) == tuple(shifts[17])
+    assert Draws(seed=6, scenes=7, target_views=1, source_as_target=0.5, source_target_noise=0.3).shift(17) != tuple(
+        shifts[17]
+    )
+    assert Draws(seed=5, scenes=7, target_views=1, source_as_target=0.5).shift(17) is None

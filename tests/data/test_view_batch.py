@@ -142,3 +142,14 @@ def test_a_scene_of_one_view_cannot_be_evaluated(tmp_path):
 )
 def test_spread(count, wanted, expected):
     assert spread(count, wanted) == expected
+
+
+def test_only_targets_that_are_their_source_are_shifted(reader):
+    scene = reader.load(0)
+    shift = (0.1, -0.2, 0.3)
+    plain, moved = (ViewBatch.collate([Sample(scene, 1, [1, 0, 2], 0, s)]) for s in (None, shift))
+    change = moved.target_cameras.c2w - plain.target_cameras.c2w
+    expected = torch.zeros_like(change)
+    expected[0, 0, :3, 3] = torch.tensor(shift)
+    assert torch.equal(change, expected)
+    assert torch.equal(moved.source_cameras.c2w, plain.source_cameras.c2w)

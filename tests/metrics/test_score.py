@@ -25,7 +25,7 @@ SIZE = 8
 class Reader:
     """Scenes of grey images: view i of scene s has the level `levels[s][i]`."""
 
-    near, far, identity = 0.5, 2.0, "grey"
+    identity = "grey"
 
     def __init__(self, levels, depth=None, mask=None):
         self.levels, self.depth, self.mask = levels, depth, mask
@@ -51,7 +51,7 @@ class Reader:
         names = tuple(self.view_names(index)[i] for i in views)
         extra = {} if self.depth is None else {"depth": self.depth.expand(n, -1, -1)}
         extra |= {} if self.mask is None else {"mask": self.mask.expand(n, -1, -1)}
-        return Scene(self.scene_id(index), names, pixels, cameras, self.near, self.far, **(extra if truth else {}))
+        return Scene(self.scene_id(index), names, pixels, cameras, 0.5, 2.0, **(extra if truth else {}))
 
 
 def grey(*levels):

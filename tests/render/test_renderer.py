@@ -106,6 +106,26 @@ def test_empty_space_shows_the_background_at_the_far_end():
     assert torch.equal(out.depth, torch.full((1, 4), FAR))
 
 
+def test_without_a_background_the_farthest_sample_is_opaque():
+    """Same as a wall of the field's own colour at the far end: against a naive loop over the samples."""
+
+    def haze(points):
+        return points.abs().clamp(0, 1), 0.4 + points[..., 2] ** 2
+
+    bundle = rays(4)
+    out = renderer(8, 0, background=None).render(haze, bundle)
+    width = (FAR - NEAR) / 8
+    for k in range(4):
+        colour, through = torch.zeros(3), 1.0
+        for i in range(8):
+            point = bundle.origins[0, k] + (NEAR + (i + 0.5) * width) * bundle.directions[0, k]
+            rgb, density = haze(point)
+            hit = 1.0 if i == 7 else 1 - math.exp(-float(density) * width)
+            colour, through = colour + through * hit * rgb, through * (1 - hit)
+        assert out.rgb[0, k].tolist() == pytest.approx(colour.tolist(), abs=1e-5)
+    assert out.opacity.tolist() == [pytest.approx([1.0] * 4)]
+
+
 def test_chunks_change_nothing_and_one_ray_works():
     bundle = rays(11)
     whole = renderer().render(blobs, bundle)

@@ -16,13 +16,15 @@ from nerfdiff.errors import DataError
 class Sample:
     """What a batch is made of: positions of a source and of target views in a scene.
 
-    `draw` is the sample's number within the run; in evaluation, the scene's within its split.
+    `draw` is the sample's number within the run; in evaluation, the scene's within its split. `source_shift` moves
+    the cameras of those targets that are the source itself, in scene units along the source camera's axes.
     """
 
     scene: Scene
     source: int
     targets: Sequence[int]
     draw: int
+    source_shift: tuple[float, float, float] | None = None
 
 
 @dataclass
@@ -82,7 +84,7 @@ class ViewBatch:
             # exactly the identity, where R·Rᵀ of a pose from a text file only nearly is
             source_cameras=replace(sources, c2w=torch.eye(4).repeat(len(samples), 1, 1)),
             target_pixels=of_targets([scene.pixels for scene in scenes]),
-            target_cameras=targets.relative_to(sources[:, None]),
+            target_cameras=_shifted(targets.relative_to(sources[:, None]), samples),
             near=torch.tensor([scene.near for scene in scenes]),
             far=torch.tensor([scene.far for scene in scenes]),
             scene_ids=tuple(scene.id for scene in scenes),
@@ -124,3 +126,13 @@ class ViewBatch:
             elif isinstance(value, Tensor):
                 changes[field.name] = function(value)
         return replace(self, **changes)
+
+
+def _shifted(relative: Cameras, samples: Sequence[Sample]) -> Cameras:
+    """Cameras [samples, targets] relative to their sources, with the sources' own copies moved."""
+    c2w = relative.c2w.clone()
+    for k, sample in enumerate(samples):
+        if sample.source_shift is not None:
+            own = [position for position, target in enumerate(sample.targets) if target == sample.source]
+            c2w[k, own, :3, 3] += torch.tensor(sample.source_shift)
+    return replace(relative, c2w=c2w)

@@ -30,7 +30,7 @@ from nerfdiff.cameras import Cameras
 from nerfdiff.data.scene import Scene, SceneReader
 from nerfdiff.errors import DataError
 
-FORMAT = "1"  # to be raised when the files above change their meaning
+FORMAT = "2"  # to be raised when the files above change their meaning
 MAX_THREADS = 16  # decoding releases the interpreter lock, but not all the time
 log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ class CachedReader:
 
     def __init__(self, reader: SceneReader, folder: str | Path, name: str):
         self.reader = reader
-        self.near, self.far, self.identity = reader.near, reader.far, reader.identity
+        self.identity = reader.identity
         self._fingerprint = reader.fingerprint()
         prefix = f"{name}-{_short(FORMAT + reader.identity)}"
         self.path = Path(folder) / f"{prefix}-{_short(self._fingerprint)}"
@@ -68,6 +68,7 @@ class CachedReader:
             raise self._damaged()
         with np.load(self.path / "cameras.npz") as arrays:
             self._c2w, self._K = (torch.from_numpy(arrays[key]) for key in ("c2w", "K"))
+            self._bounds: list[list[float]] = arrays["bounds"].tolist()
         self._file: int | None = None
 
     def __len__(self) -> int:
@@ -93,8 +94,8 @@ class CachedReader:
             views=tuple(names[p] for p in positions),
             pixels=self._read(rows),
             cameras=Cameras(self._c2w[rows], self._K[rows], *self._shape[2:]),
-            near=self.near,
-            far=self.far,
+            near=self._bounds[index][0],
+            far=self._bounds[index][1],
         )
 
     def _read(self, rows: Sequence[int]) -> UInt8[Tensor, "rows 3 height width"]:
@@ -155,6 +156,7 @@ def _write(reader: SceneReader, folder: Path) -> None:
     _require_space(folder.parent, starts[-1] * image_bytes)
     folder.mkdir()
     c2w, K = np.empty((starts[-1], 4, 4), np.float32), np.empty((starts[-1], 3, 3), np.float32)
+    bounds = np.empty((len(views), 2))  # near and far of each scene
 
     def copy(index: int) -> None:
         scene = reader.load(index)
@@ -165,6 +167,7 @@ def _write(reader: SceneReader, folder: Path) -> None:
             )
         rows = slice(starts[index], starts[index + 1])
         c2w[rows], K[rows] = scene.cameras.c2w.numpy(), scene.cameras.K.numpy()
+        bounds[index] = scene.near, scene.far
         # written, not mapped: a full disk is then an error and no crash of the process
         with open(folder / "images.u8", "r+b") as file:
             file.seek(starts[index] * image_bytes)
@@ -179,7 +182,7 @@ def _write(reader: SceneReader, folder: Path) -> None:
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    np.savez(folder / "cameras.npz", c2w=c2w, K=K)
+    np.savez(folder / "cameras.npz", c2w=c2w, K=K, bounds=bounds)
     ids = [reader.scene_id(index) for index in range(len(reader))]
     index = {"ids": ids, "views": views, "height": height, "width": width}
     (folder / "scenes.json").write_text(json.dumps(index))

@@ -32,11 +32,14 @@ class SceneDataModule(LightningDataModule):
         name: the dataset's name, for results and caches.
         root: the dataset's folder.
         image_size: side in pixels, or (height, width), to which all images are resized (None: as stored).
+        background: grey level behind everything, for the renderer; None where the farthest sample is opaque.
         reader: makes the reader of a split, as `reader(root=..., split=..., image_size=...)`.
         train_scenes: how many scenes to train on, spread evenly over the split (None: all).
         train_source_view: number of the view that every draw takes as its source (None: any view).
         target_views: T, target views per training draw.
         source_as_target: probability that a draw's first target is its source view.
+        source_target_noise: variance of the noise on the camera position of such a target, in squared scene units
+            (paper, appendix: 0.3 on Clevr3D).
         batch_size: draws per optimizer step, over all ranks and accumulated batches.
         val_source_view, source_view: number of the input view in validation and in the test.
         val_scenes, val_targets: how many held-out scenes, and targets of each, one validation looks at.
@@ -57,11 +60,13 @@ class SceneDataModule(LightningDataModule):
         name: str,
         root: str | Path,
         image_size: int | Sequence[int] | None,
+        background: float | None,
         reader: Callable[..., SceneReader],
         train_scenes: int | None,
         train_source_view: int | None,
         target_views: int,
         source_as_target: float,
+        source_target_noise: float,
         batch_size: int,
         val_source_view: int,
         val_scenes: int,
@@ -93,12 +98,17 @@ class SceneDataModule(LightningDataModule):
                 raise ConfigError(f"data.{key}={value} must be at least 1")
         if not 0 <= source_as_target <= 1:
             raise ConfigError(f"data.source_as_target={source_as_target} is a probability, from 0 to 1")
+        if source_target_noise < 0:
+            raise ConfigError(f"data.source_target_noise={source_target_noise} is a variance, of at least 0")
+        if background is not None and not 0 <= background <= 1:
+            raise ConfigError(f"data.background={background} is a grey level from 0 to 1, or null")
         if not 0 <= seed < 2**64:
             raise ConfigError(f"data.seed={seed} must be from 0 to 2^64 - 1")
         self.name, self.make_reader = name, reader
-        self.root, self.image_size = root, image_size
+        self.root, self.image_size, self.background = root, image_size, background
         self.train_scenes, self.train_source_view = train_scenes, train_source_view
         self.target_views, self.source_as_target = target_views, source_as_target
+        self.source_target_noise = source_target_noise
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
         self.val_source_view, self.val_scenes, self.val_targets = val_source_view, val_scenes, val_targets
         self.source_view, self.eval_scenes, self.eval_stride = source_view, eval_scenes, eval_stride
@@ -167,7 +177,7 @@ class SceneDataModule(LightningDataModule):
                 f"trainer.accumulate_grad_batches={accumulate}"
             )
         scenes = len(spread(len(self.train_reader), self.train_scenes))
-        draws = Draws(self.seed, scenes, self.target_views, self.source_as_target)
+        draws = Draws(self.seed, scenes, self.target_views, self.source_as_target, self.source_target_noise)
         sampler = DrawSampler(
             self.batch_size,
             micro_batch_size,

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Int64, UInt64
 from torch.utils.data import Sampler
 
-SCENE_ORDER, VIEWS = 0, 1  # streams of random numbers that must not meet
+SCENE_ORDER, VIEWS, SHIFTS = 0, 1, 2  # streams of random numbers that must not meet
 
 
 def random_bits(seed: int, stream: int, counter: int, count: int) -> UInt64[np.ndarray, "{count}"]:
@@ -36,12 +36,14 @@ class Draws:
         target_views: T, target views per draw, all different.
         source_as_target: probability that the first target is the source view itself; apart from that,
             targets are never the source.
+        source_target_noise: variance of the noise on the position of such a target's camera, in squared scene units.
     """
 
     seed: int
     scenes: int
     target_views: int
     source_as_target: float
+    source_target_noise: float = 0.0
 
     def scene(self, draw: int) -> int:
         """Index of the draw's scene."""
@@ -61,6 +63,17 @@ class Draws:
         if bits[views] < self.source_as_target * 2.0**64:
             targets[0] = source
         return source, tuple(targets)
+
+    def shift(self, draw: int) -> tuple[float, float, float] | None:
+        """How far the camera of a target that is the source itself is moved; None without noise.
+
+        Seen from exactly where it was taken, an input view is explained by a plane in front of the camera (paper,
+        appendix, "Clevr3D").
+        """
+        if not self.source_target_noise:
+            return None
+        bits = np.random.Generator(np.random.Philox(key=[self.seed, SHIFTS], counter=[0, draw, 0, 0]))
+        return tuple(bits.normal(0, self.source_target_noise**0.5, 3).tolist())
 
 
 class DrawSampler(Sampler[list[int]]):

@@ -48,8 +48,6 @@ class Scene:
 class SceneReader(Protocol):
     """One split of one dataset: an ordered collection of scenes read lazily from disk."""
 
-    near: float
-    far: float
     identity: str
     """What is read and how (folder and settings): two readers of one identity read the same files alike."""
 

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from nerfdiff.cameras import Cameras
 from nerfdiff.data import images
 from nerfdiff.data.fingerprint import fingerprint_folders
+from nerfdiff.data.framing import Framing
 from nerfdiff.data.posed_files import inverse_pose, read_pose
 from nerfdiff.data.scene import MissingSplit, Scene
 from nerfdiff.data.srn_intrinsics import SceneIntrinsics, read_view_intrinsics
@@ -48,6 +49,7 @@ class SRNReader:
         split: "train", "val" or "test".
         near, far: bounds of every scene as distances along rays.
         image_size: (height, width), or one side of a square, to resize to; None keeps the stored size.
+        crop: (height, width), or one side of a square, to cut out of the middle before; None keeps all.
 
     Raises:
         ConfigError: an unknown category or split, or bounds that are not 0 < near < far.
@@ -63,6 +65,7 @@ class SRNReader:
         near: float,
         far: float,
         image_size: int | Sequence[int] | None = None,
+        crop: int | Sequence[int] | None = None,
     ):
         if category not in FOLDERS:
             raise ConfigError(f"SRN category {category!r} is unknown; choose one of {', '.join(FOLDERS)}")
@@ -71,14 +74,14 @@ class SRNReader:
         if not 0 < near < far:
             raise ConfigError(f"near = {near} and far = {far} must satisfy 0 < near < far")
         self.near, self.far = float(near), float(far)
-        self.image_size = _height_width(image_size)
+        self.framing = Framing.of(crop, image_size)
         self.folder = _find_split(Path(root), category, split)
         self.scenes = tuple(
             sorted(e.name for e in os.scandir(self.folder) if e.is_dir() and not e.name.startswith("."))
         )
         if not self.scenes:
             raise DataError(f"{self.folder}: the {split} split is empty; expected one folder per scene in it")
-        self.identity = f"srn {self.folder.resolve()} {self.image_size}"
+        self.identity = f"srn {self.folder.resolve()} {self.framing}"
         self._listed: dict[int, _Folder] = {}
 
     def __len__(self) -> int:
@@ -101,8 +104,7 @@ class SRNReader:
         stored = [images.decode(folder.rgb[p]) for p in positions]
         shared = _shared_intrinsics(folder.path)
         K = self._intrinsics(folder, names, [image.shape[:2] for image in stored], shared)
-        if self.image_size is not None:
-            stored = [images.resize(image, self.image_size) for image in stored]
+        stored = [self.framing.image(image) for image in stored]
         for position, image in zip(positions, stored, strict=True):
             if image.shape != stored[0].shape:
                 raise DataError(
@@ -120,8 +122,8 @@ class SRNReader:
             cameras=Cameras(torch.from_numpy(np.stack(poses)).float(), torch.from_numpy(K).float(), height, width),
             near=self.near,
             far=self.far,
-            mask=self._truth(folder, names, "mask", (height, width)) if truth else None,
-            depth=self._truth(folder, names, "depth", (height, width)) if truth else None,
+            mask=self._truth(folder, names, "mask") if truth else None,
+            depth=self._truth(folder, names, "depth") if truth else None,
         )
 
     def _list(self, index: int) -> _Folder:
@@ -147,31 +149,19 @@ class SRNReader:
     ) -> Float[np.ndarray, "views 3 3"]:
         """K of each view, at the size at which it will be returned."""
         if shared is not None:
-            K = np.stack([shared.K(*size) for size in sizes])
+            K = [shared.K(*size) for size in sizes]
         else:
             files = [folder.path / "intrinsics" / f"{name}.txt" for name in names]
-            K = np.stack([read_view_intrinsics(f, *size) for f, size in zip(files, sizes, strict=True)])
-        if self.image_size is not None:
-            scale = np.array([[self.image_size[1] / w, self.image_size[0] / h, 1] for h, w in sizes])
-            K = K * scale[:, :, None]
-        return K
+            K = [read_view_intrinsics(f, *size) for f, size in zip(files, sizes, strict=True)]
+        return np.stack([self.framing.K(k, *size) for k, size in zip(K, sizes, strict=True)])
 
-    def _truth(self, folder: _Folder, names: Sequence[str], kind: str, size: tuple[int, int]):
+    def _truth(self, folder: _Folder, names: Sequence[str], kind: str):
         """`mask/<view>.png` or `depth/<view>.npz` of generated scenes; None where the folder is not there."""
         if not (folder.path / kind).is_dir():
             return None
         read, suffix = (images.decode_mask, "png") if kind == "mask" else (_read_depth, "npz")
         values = [read(folder.path / kind / f"{name}.{suffix}") for name in names]
-        return torch.from_numpy(np.stack([images.resize_nearest(value, size) for value in values]))
-
-
-def _height_width(image_size: int | Sequence[int] | None) -> tuple[int, int] | None:
-    if image_size is None:
-        return None
-    size = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
-    if len(size) != 2 or not all(isinstance(side, int) and side > 0 for side in size):
-        raise ConfigError(f"image_size {image_size!r} is neither a side in pixels nor [height, width]")
-    return size
+        return torch.from_numpy(np.stack([self.framing.values(value) for value in values]))
 
 
 def _shared_intrinsics(scene: Path) -> SceneIntrinsics | None:

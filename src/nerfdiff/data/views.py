@@ -36,7 +36,7 @@ class TrainingViews(Dataset[Sample]):
         source, targets = self.draws.views(draw, count, fixed)
         wanted = sorted({source, *targets})
         scene = self.reader.load(index, wanted)
-        return Sample(scene, wanted.index(source), [wanted.index(t) for t in targets], draw)
+        return Sample(scene, wanted.index(source), [wanted.index(t) for t in targets], draw, self.draws.shift(draw))
 
 
 class EvaluationScenes(Dataset[Sample]):

@@ -34,14 +34,15 @@ class Renderer:
 
     Args:
         uniform_samples, importance_samples: per ray; the paper uses 64 and 64.
-        background: grey level behind everything (1 is white).
+        background: grey level behind everything (1 is white); None where a scene has no empty background: the
+            farthest sample of each ray is then opaque.
         chunk: points per evaluation of the field at most. Under autograd each chunk is recomputed in the backward
             pass, so what is kept, beside the rays themselves, is O(chunk) whatever the number of samples.
     """
 
     uniform_samples: int
     importance_samples: int
-    background: float
+    background: float | None
     chunk: int
 
     @property
@@ -112,8 +113,12 @@ class Renderer:
             density = torch.cat([density, density_drawn], -1).gather(-1, order)
         lengths = edges_between(distances, near, far).diff(dim=-1)
         weights = compositing_weights(density, lengths)
+        if self.background is None:
+            weights = torch.cat([weights[..., :-1], 1 - weights[..., :-1].sum(-1, keepdim=True)], -1)
         opacity = weights.sum(-1)
-        colour = (weights[..., None] * rgb).sum(-2) + (1 - opacity)[..., None] * self.background
+        colour = (weights[..., None] * rgb).sum(-2)
+        if self.background is not None:
+            colour = colour + (1 - opacity)[..., None] * self.background
         reached = opacity > 1e-6
         expected = (weights * distances).sum(-1) / opacity.clamp_min(1e-6)
         return colour, opacity, torch.where(reached, expected, far)

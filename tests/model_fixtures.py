@@ -20,7 +20,13 @@ CONFIG = {
     },
     "field": {"channels": 8, "hidden": 16, "density_shift": -1.0, "density_scale": 16.0},
     "render": {"uniform_samples": 6, "importance_samples": 6, "background": 1.0, "chunk": 10**6},
-    "conditioning": {"name": "rendered", "image": "rendered", "ray_maps": False, "cross_attention": True},
+    "conditioning": {
+        "name": "rendered",
+        "image": "rendered",
+        "ray_maps": False,
+        "cross_attention": True,
+        "residual_std": None,
+    },
 }
 
 

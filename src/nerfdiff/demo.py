@@ -38,7 +38,7 @@ def demo(cfg: DictConfig) -> list[ResultRow]:
         overrides += [f"paths.output_dir={run / 'evaluation'}", f"baselines={str(index == 0).lower()}"]
         rows += evaluate(prepare("evaluate", overrides))
 
-    console.print(Rule("held-out views of unseen cars"), rich_table(rows))
+    console.print(Rule("held-out views of unseen cars"), rich_table(rows, console.width))
     write_markdown(run / "table.md", rows)
     pictures = sorted((run / "evaluation").glob("*/*.png")) + sorted((run / "evaluation").glob("*/*.mp4"))
     console.print("Open:", *(f"  {path}" for path in pictures), f"  {run / 'previews'}", sep="\n")

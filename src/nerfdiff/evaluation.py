@@ -121,7 +121,8 @@ def evaluate(cfg: DictConfig) -> list[ResultRow]:
     if cfg.orbit.scenes > 0:
         log.info("video: %s", _video(subject, strategies[0], folder / "orbit.mp4"))
     write_markdown(folder / "table.md", rows)
-    Console(width=None if sys.stdout.isatty() else 200).print(rich_table(rows))
+    console = Console(width=None if sys.stdout.isatty() else 200)
+    console.print(rich_table(rows, console.width))
     log.info("rows: %s   scores per image and scene: %s", cfg.results, folder / "scores")
     return rows
 

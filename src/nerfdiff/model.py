@@ -22,7 +22,7 @@ class NerfDiff(nn.Module):
         unet: sizes shared by the encoder and the CDM ("the image encoder retains the same architecture").
         field: `channels` of the triplane, and the decoder's `hidden`, `density_shift`, `density_scale`.
         render: the `Renderer`'s settings.
-        conditioning: `image`, `ray_maps`, `cross_attention` of the CDM, and a `name` for records.
+        conditioning: `image`, `ray_maps`, `cross_attention`, `residual_std` of the CDM, and a `name` for records.
     """
 
     def __init__(self, name: str, unet: Mapping, field: Mapping, render: Mapping, conditioning: Mapping):

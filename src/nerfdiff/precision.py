@@ -1,12 +1,15 @@
 """Where bf16 must not go: coordinates, compositing, camera algebra."""
 
+from contextlib import AbstractContextManager, nullcontext
+
 import torch
 from torch import Tensor
 
 
-def full_precision(device: torch.device):
+def full_precision(device: torch.device) -> AbstractContextManager:
     """A context that keeps matrix products out of autocast."""
-    return torch.autocast(device.type, enabled=False)
+    # the meta device computes nothing, and knows no autocast
+    return nullcontext() if device.type == "meta" else torch.autocast(device.type, enabled=False)
 
 
 def at_least_single(tensor: Tensor) -> Tensor:

@@ -12,7 +12,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerfdiff.callbacks.checkpoint import ClearCheckpointIO
 from nerfdiff.checkpoint import check_resumable, export_model, last_checkpoint, load_model
+from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.errors import CheckpointError, ConfigError
+from nerfdiff.memory import WEIGHTS_ADAM_EMA, require_memory
 from nerfdiff.modules.nerfdiff_module import NerfDiffModule
 
 log = logging.getLogger(__name__)
@@ -40,6 +42,8 @@ def train(cfg: DictConfig) -> dict[str, float]:
     last = _checkpoint_to_resume(output_dir, cfg, model_config)
 
     trainer = build_trainer(cfg)
+    datamodule = instantiate(cfg.data)
+    _require_memory(model_config, trainer, datamodule)
     module = NerfDiffModule(
         model=model_config,
         losses=plain(cfg.losses),
@@ -48,7 +52,6 @@ def train(cfg: DictConfig) -> dict[str, float]:
         channels_last=cfg.channels_last,
         seed=cfg.seed,
     )
-    datamodule = instantiate(cfg.data)
     if trainer.is_global_zero:
         output_dir.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(cfg, output_dir / "config.yaml", resolve=True)
@@ -64,6 +67,13 @@ def train(cfg: DictConfig) -> dict[str, float]:
         log.info("weights: %s", path)
         log.info("previews: %s   curves: tensorboard --logdir %s", output_dir / "previews", output_dir)
     return {name: float(value) for name, value in trainer.callback_metrics.items()}
+
+
+def _require_memory(model_config: dict, trainer: Trainer, data: SceneDataModule) -> None:
+    first = data.reader("train").load(0, [0]).cameras
+    batch_size = max(1, data.batch_size // (trainer.world_size * trainer.accumulate_grad_batches))
+    device = trainer.strategy.root_device
+    require_memory(model_config, device, batch_size, data.target_views, first.height, first.width)
 
 
 def build_trainer(cfg: DictConfig) -> Trainer:
@@ -115,10 +125,9 @@ def _checkpoint_to_resume(output_dir: Path, cfg: DictConfig, model_config: dict)
 
 def _announce(module: NerfDiffModule, last: Path | None) -> None:
     counts = module.model.parameter_count()
-    # fp32 weights, gradients, Adam's two moments and the average.
-    state = 5 * 4 * counts["total"] / 2**30
+    state = WEIGHTS_ADAM_EMA * counts["total"] / 2**30
     log.info(
-        "%s/%s: %.1fM parameters (encoder %.1fM, CDM %.1fM); weights, gradients, Adam and EMA take %.2f GiB",
+        "%s/%s: %.1fM parameters (encoder %.1fM, CDM %.1fM); weights, Adam and EMA take %.2f GiB",
         module.model.name,
         module.model.conditioning,
         *(counts[part] / 1e6 for part in ("total", "encoder", "denoiser")),

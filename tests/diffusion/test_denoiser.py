@@ -6,9 +6,10 @@ from nerfdiff.cameras import Cameras
 from nerfdiff.errors import ConfigError
 
 VARIANTS = {
-    "rendered": {"image": "rendered", "ray_maps": False, "cross_attention": True},
-    "concat": {"image": "source", "ray_maps": True, "cross_attention": False},
-    "cross_attention": {"image": "none", "ray_maps": True, "cross_attention": True},
+    "rendered": {"image": "rendered", "ray_maps": False, "cross_attention": True, "residual_std": None},
+    "preconditioned": {"image": "rendered", "ray_maps": False, "cross_attention": True, "residual_std": 0.2},
+    "concat": {"image": "source", "ray_maps": True, "cross_attention": False, "residual_std": None},
+    "cross_attention": {"image": "none", "ray_maps": True, "cross_attention": True, "residual_std": None},
 }
 
 
@@ -51,6 +52,24 @@ def test_a_denoised_image_is_alpha_z_minus_sigma_v():
     x0 = net.denoise(z, t, condition)
     torch.testing.assert_close(x0[0], 0.5**0.5 * (z[0] - v[0]))
     torch.testing.assert_close(x0[1], -v[1])
+
+
+def test_an_untrained_preconditioned_cdm_believes_the_rendering_where_all_is_noise():
+    net = model(conditioning={"residual_std": 0.2})  # its last layer is zero
+    condition = condition_of(net, torch.rand(1, 3, 16, 16))
+    z = torch.randn(2, 3, 16, 16)
+    rendered = 2 * condition.rendered - 1
+    torch.testing.assert_close(net.denoise(z, torch.tensor(1.0), condition), rendered)
+    # and in between it is the posterior mean, in the form of a Kalman gain
+    alpha = sigma = 0.5**0.5
+    gain = 0.04 * alpha / (0.04 * alpha**2 + sigma**2)
+    expected = rendered + gain * (z - alpha * rendered)
+    torch.testing.assert_close(net.denoise(z, torch.tensor(0.5), condition), expected)
+
+
+def test_only_a_rendered_condition_can_be_built_upon():
+    with pytest.raises(ConfigError, match=r"residual_std=0\.2 needs conditioning\.image=rendered"):
+        model(conditioning={"image": "source", "ray_maps": True, "residual_std": 0.2})
 
 
 def test_the_denoising_loss_flows_back_through_the_rendering():

@@ -36,9 +36,24 @@ def test_numbers_that_are_not_finite_are_shown():
 
 def test_rich_and_markdown_show_the_same(tmp_path):
     console = Console(file=io.StringIO(), width=120)
-    console.print(rich_table(ROWS, title="Held-out views"))
+    console.print(rich_table(ROWS, 120, title="Held-out views"))
     printed = console.file.getvalue()
     for text in ("Held-out views", "strategy", "PSNR ↑", "23.46", "mean|image", "0.0123"):
         assert text in printed
     write_markdown(tmp_path / "table.md", ROWS)
     assert (tmp_path / "table.md").read_text() == markdown(ROWS)
+
+
+def test_a_narrow_table_keeps_whole_columns_and_names_the_others():
+    rows = [
+        ResultRow(run_id=name, strategy=name, dataset="srn_cars/test", seed=0, psnr=20.0, ssim=0.5, params=10**6)
+        for name in ("none", "cdm")
+    ]
+    console = Console(file=io.StringIO(), width=40)
+    console.print(rich_table(rows, console.width))
+    lines = console.file.getvalue().splitlines()
+    assert {len(line) for line in lines[:6]} == {len(lines[0])} and len(lines[0]) <= 40
+    text = " ".join(" ".join(lines).split())
+    for part in ("none", "cdm", "20.00", "0.500", "dataset srn_cars/test, seed 0", "too narrow for: parameters, M"):
+        assert part in text
+    assert "…" not in text

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfdiff.cameras import Cameras
+from nerfdiff.diffusion.preconditioning import gaussian_velocity
 from nerfdiff.diffusion.schedule import alpha_sigma, expand, x0_from_v
 from nerfdiff.diffusion.unet import UNet
 from nerfdiff.errors import ConfigError
@@ -42,10 +43,12 @@ class Denoiser(nn.Module):
         ray_maps: concatenate the origin and direction of every pixel's ray in the input camera's space. Without
             a rendered image nothing else tells the CDM which view is wanted.
         cross_attention: attend to the encoder's features after every attention block.
+        residual_std: None for the paper's plain v-prediction; a number lets the U-Net predict what is beyond
+            x0 ~ N(rendering, residual_std²), in units of [-1, 1] (see `gaussian_velocity`).
         unet: the U-Net's sizes.
     """
 
-    def __init__(self, image: str, ray_maps: bool, cross_attention: bool, unet: Mapping):
+    def __init__(self, image: str, ray_maps: bool, cross_attention: bool, residual_std: float | None, unet: Mapping):
         super().__init__()
         if image not in IMAGES:
             raise ConfigError(f"conditioning.image must be one of {', '.join(IMAGES)}, got {image!r}")
@@ -53,8 +56,14 @@ class Denoiser(nn.Module):
             raise ConfigError(
                 f"conditioning.image={image} does not show the CDM which view is wanted: set conditioning.ray_maps=true"
             )
+        if residual_std is not None and (image != "rendered" or not 0 < residual_std <= 1):
+            raise ConfigError(
+                f"conditioning.residual_std={residual_std} needs conditioning.image=rendered and a number above 0, at "
+                "most 1; null is the paper's prediction of v"
+            )
         self.image = image
         self.ray_maps = ray_maps
+        self.residual_std = residual_std
         channels = 3 + 3 * (image != "none") + 6 * ray_maps
         self.unet = UNet(channels, 3, **unet, with_time=True, cross_attention=cross_attention, zero_output=True)
         self.cross_attention = cross_attention
@@ -71,7 +80,12 @@ class Denoiser(nn.Module):
             origins = rays.origins / rays.near[..., None]
             inputs.append(torch.cat([origins, rays.directions], -1).movedim(-1, 1))
         context = condition.features if self.cross_attention else ()
-        return self.unet(torch.cat(inputs, 1), t, context)[0].float()
+        output = self.unet(torch.cat(inputs, 1), t, context)[0].float()
+        if self.residual_std is None:
+            return output
+        alpha, sigma = (expand(c, z) for c in alpha_sigma(t))
+        mean, scale = gaussian_velocity(z, 2 * condition.rendered - 1, self.residual_std, alpha, sigma)
+        return mean + scale * output
 
     def forward(
         self, z: Float[Tensor, "batch 3 height width"], t: Float[Tensor, "batch"], condition: Condition

@@ -22,11 +22,7 @@ class Column:
 
 
 COLUMNS = (
-    Column("dataset", "dataset"),
     Column("strategy", "strategy"),
-    Column("weights", "weights"),
-    Column("seed", "seed"),
-    Column("n_scenes", "scenes"),
     Column("psnr", "PSNR ↑", ".2f"),
     Column("ssim", "SSIM ↑", ".3f"),
     Column("ssim_gaussian", "SSIM (Gaussian) ↑", ".3f"),
@@ -43,6 +39,10 @@ COLUMNS = (
     Column("distill_s_median", "distil, s", ".3g"),
     Column("peak_mem_bytes", "memory, GiB", ".2f", 2**-30),
     Column("params", "parameters, M", ".1f", 1e-6),
+    Column("dataset", "dataset"),
+    Column("weights", "weights"),
+    Column("seed", "seed"),
+    Column("n_scenes", "scenes"),
     Column("device", "device"),
 )
 
@@ -66,14 +66,30 @@ def _cell(value: Any, column: Column) -> str:
     return format(value * column.scale, column.format) if column.format else str(value)
 
 
-def rich_table(rows: Sequence[ResultRow], title: str | None = None) -> Table:
-    """A table to print with rich."""
+def rich_table(rows: Sequence[ResultRow], width: int, title: str | None = None) -> Table:
+    """A table to print with rich, no wider than `width` characters.
+
+    Below it stands what is the same in every row, and the headings of columns that did not fit.
+    """
     headings, body = cells(rows)
-    table = Table(title=title)
+    columns = list(zip(headings, zip(*body, strict=True), strict=True))
+    told = {"dataset", "weights", "seed", "scenes", "images", "device"} if len(rows) > 1 else set()
+    same = [(heading, values[0]) for heading, values in columns if heading in told and len(set(values)) == 1]
+    columns = [column for column in columns if column[0] not in dict(same)]
+    shown, left = [], width - 1
+    for heading, values in columns:
+        needed = max(map(len, (*([heading] if len(heading) <= 9 else heading.split()), *values)))
+        left -= needed + 3
+        if left >= 0 or not shown:
+            shown.append((heading, values, needed))
+    notes = [", ".join(f"{heading} {value}" for heading, value in same)]
+    if len(shown) < len(columns):
+        notes.append("too narrow for: " + ", ".join(heading for heading, _ in columns[len(shown) :]))
+    table = Table(title=title, caption="\n".join(filter(None, notes)) or None, caption_justify="left")
     numeric = {c.heading for c in COLUMNS if c.format} | {"scenes", "seed", "images"}
-    for heading in headings:
-        table.add_column(heading, justify="right" if heading in numeric else "left")
-    for line in body:
+    for heading, _, needed in shown:
+        table.add_column(heading, justify="right" if heading in numeric else "left", width=needed)
+    for line in zip(*(values for _, values, _ in shown), strict=True):
         table.add_row(*line)
     return table
 

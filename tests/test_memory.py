@@ -1,0 +1,50 @@
+"""What the tracer counts, on tensors whose sizes are known, and what is done with it."""
+
+import pytest
+import torch
+
+from model_fixtures import config
+from nerfdiff import memory
+from nerfdiff.errors import ConfigError
+from nerfdiff.memory import PeakMemory, require_memory, training_memory
+from nerfdiff.model import build_on_meta
+
+
+@pytest.mark.parametrize("device", ["cpu", "meta"])
+def test_the_peak_of_known_tensors(device):
+    with PeakMemory() as tracker:
+        a = torch.empty(1000, device=device)
+        b = a * 2  # 8000 bytes
+        view = b.view(10, 100)
+        del a, b  # the view keeps its storage
+        assert tracker.live == 4000
+        c = view + 1
+        c += 1  # in place: no new memory
+        assert (tracker.live, tracker.peak) == (8000, 8000)
+        del view, c
+    assert (tracker.live, tracker.peak) == (0, 8000)
+
+
+def test_activations_kept_for_the_backward_pass_count():
+    layers = torch.nn.Sequential(*(torch.nn.Sequential(torch.nn.Linear(10, 10), torch.nn.Sigmoid()) for _ in range(5)))
+    with PeakMemory() as tracker:
+        layers(torch.empty(100, 10)).sum().backward()
+    # sigmoids keep their 100 x 10 outputs, which are the inputs of the next layer
+    assert 5 * 4000 <= tracker.peak <= 9 * 4000
+
+
+def test_a_step_holds_the_gradients_and_grows_with_the_batch_but_little_with_checkpointing():
+    parameters = sum(p.numel() for p in build_on_meta(config()).parameters())
+    one, four = (training_memory(config(), batch, 1, 16, 16) for batch in (1, 4))
+    assert one.state == 16 * parameters and one.step > 4 * parameters
+    assert four.state == one.state and four.step > one.step
+    frugal = training_memory(config(unet={"checkpointing": True}, render={"chunk": 512}), 4, 1, 16, 16)
+    assert frugal.step < four.step
+
+
+def test_what_does_not_fit_is_refused_with_what_it_takes(monkeypatch):
+    monkeypatch.setattr(memory, "free_memory", lambda device: 10**6)
+    with pytest.raises(ConfigError, match=r"training takes about .* cpu has 0\.0 GiB free.*accumulate_grad_batches"):
+        require_memory(config(), torch.device("cpu"), 1, 1, 16, 16)
+    monkeypatch.setattr(memory, "free_memory", lambda device: 10**15)
+    require_memory(config(), torch.device("cpu"), 1, 1, 16, 16)

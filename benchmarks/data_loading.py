@@ -1,8 +1,9 @@
-"""Images per second from files on disk to training batches.
+"""Images per second from files on disk to training batches, of any dataset.
 
-    python benchmarks/data_loading.py data/srn_cars --category cars --split train
+    python benchmarks/data_loading.py data=srn_cars data.root=data/srn_cars
+    python benchmarks/data_loading.py data=clevr3d data.root=data/clevr3d data.image_size=[60,80] --workers 0 4
 
-Times, in this order: reading the files, decoding them, the reader, the cached reader on random views, and the
+Times, in this order: reading the files, decoding them alone, the reader, the cached reader on random views, and the
 whole DataLoader. Each is warmed up, then measured several times; medians and quartiles are printed.
 """
 
@@ -13,111 +14,88 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
+from nerfdiff.cli import load_config
+from nerfdiff.data import images
 from nerfdiff.data.cache import CachedReader
 from nerfdiff.data.datamodule import SceneDataModule
-from nerfdiff.data.images import decode
 from nerfdiff.data.scene import SceneReader
-from nerfdiff.data.srn import SRNReader
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("root", type=Path, help="dataset in the SRN layout")
-    parser.add_argument("--category", default="cars")
-    parser.add_argument("--split", default="train")
-    parser.add_argument("--image-size", type=int, help="resize to this side; default: as stored")
-    parser.add_argument("--batch-size", type=int, default=32)
+    parser.add_argument("overrides", nargs="+", help="of the training config: data=… data.root=…")
     parser.add_argument("--workers", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--images", type=int, default=1000, help="images per measurement")
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory(prefix="nerfdiff-benchmark-") as cache_dir:
-        print_table(arguments, measure(arguments, cache_dir))
+        data = load_config("train", [*arguments.overrides, f"data.cache_dir={cache_dir}"]).data
+        print_table(arguments, data, measure(arguments, data))
 
 
-def measure(arguments: argparse.Namespace, cache_dir: str) -> list[tuple[str, list[float]]]:
+def measure(arguments: argparse.Namespace, data: DictConfig) -> list[tuple[str, list[float]]]:
     """(what, images per second of each repeat)."""
-    make_reader = partial(SRNReader, category=arguments.category, near=0.8, far=1.8)
-    reader = make_reader(root=arguments.root, split=arguments.split, image_size=arguments.image_size)
-    files = [
-        reader.folder / reader.scene_id(index) / "rgb" / f"{view}.png"
-        for index in range(len(reader))
-        for view in reader.view_names(index)
-    ]
-    files = list(np.random.default_rng(0).permutation(files)[: arguments.images])
-
+    reader = instantiate(data).reader("train")
     start = time.perf_counter()
     reader.fingerprint()
     print(f"fingerprint of {len(reader)} scenes: {time.perf_counter() - start:.3f} s")
     start = time.perf_counter()
-    cached = CachedReader(reader, cache_dir, "benchmark")
+    cached = CachedReader(reader, data.cache_dir, data.name)
     seconds = time.perf_counter() - start
     total = sum(len(cached.view_names(index)) for index in range(len(cached)))
     print(f"cache of {total} images: built in {seconds:.2f} s, {total / seconds:,.0f} images/s")
+    files = files_read(reader, arguments.images)
 
     def repeated(function: Callable[[], int]) -> list[float]:
         function()
         rates = []
         for _ in range(arguments.repeats):
             start = time.perf_counter()
-            images = function()
-            rates.append(images / (time.perf_counter() - start))
+            count = function()
+            rates.append(count / (time.perf_counter() - start))
         return rates
 
     results = [
         ("read the files", repeated(lambda: sum(len(file.read_bytes()) > 0 for file in files))),
-        ("decode the files", repeated(lambda: sum(decode(file).shape[2] == 3 for file in files))),
+        ("decode the files", repeated(lambda: sum(images.decode(file).shape[2] == 3 for file in files))),
         ("reader, 2 views at a time", repeated(lambda: load_pairs(reader, arguments.images))),
         ("cached reader, 2 views at a time", repeated(lambda: load_pairs(cached, arguments.images))),
     ]
-    steps = max(1, arguments.images // (2 * arguments.batch_size))
+    steps = max(1, arguments.images // (2 * data.batch_size))
     for workers in arguments.workers:
         for cache in (False, True):
-            data = SceneDataModule(
-                name="benchmark",
-                root=arguments.root,
-                image_size=arguments.image_size,
-                reader=make_reader,
-                target_views=1,
-                source_as_target=0.0,
-                source_target_noise=0.0,
-                background=1.0,
-                batch_size=arguments.batch_size,
-                val_source_view=0,
-                val_scenes=1,
-                val_targets=1,
-                source_view=0,
-                eval_scenes=None,
-                eval_stride=1,
-                num_workers=workers,
-                cache=cache,
-                cache_dir=cache_dir,
-                seed=0,
-                train_split=arguments.split,
-                val_split=arguments.split,
-            )
-            data.setup("fit")
-            rates = loader_rates(data, steps, arguments.repeats)
+            module = instantiate(data, num_workers=workers, cache=cache)
+            module.setup("fit")
+            rates = loader_rates(module, steps, arguments.repeats)
             results.append((f"DataLoader, {workers} workers, cache {'on' if cache else 'off'}", rates))
     return results
 
 
-def load_pairs(reader: SceneReader, images: int) -> int:
+def files_read(reader: SceneReader, count: int) -> list[Path]:
+    """The image files that the reader decodes for so many views."""
+    with patch.object(images, "decode", wraps=images.decode) as decode:
+        load_pairs(reader, count)
+    return [Path(call.args[0]) for call in decode.call_args_list]
+
+
+def load_pairs(reader: SceneReader, count: int) -> int:
     """Two random views of random scenes, as training asks for them."""
     generator = np.random.default_rng(0)
-    for _ in range(images // 2):
+    for _ in range(count // 2):
         index = int(generator.integers(len(reader)))
         reader.load(index, generator.choice(len(reader.view_names(index)), 2, replace=False).tolist())
-    return images // 2 * 2
+    return count // 2 * 2
 
 
 def loader_rates(data: SceneDataModule, steps: int, repeats: int) -> list[float]:
@@ -132,11 +110,10 @@ def loader_rates(data: SceneDataModule, steps: int, repeats: int) -> list[float]
     return rates[1:]
 
 
-def print_table(arguments: argparse.Namespace, results: list[tuple[str, list[float]]]) -> None:
+def print_table(arguments: argparse.Namespace, data: DictConfig, results: list[tuple[str, list[float]]]) -> None:
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
-    size = f"{arguments.image_size}²" if arguments.image_size else "stored size"
     table = Table(
-        title=f"{arguments.root} {arguments.split}, {size}, batch {arguments.batch_size}\n"
+        title=f"{data.name}: {' '.join(arguments.overrides)}, batch {data.batch_size}\n"
         f"CPU: {cpu_name()}, {os.cpu_count()} cores; GPU: {device}; torch {torch.__version__}"
     )
     for column in ("", "images/s (median)", "quartiles", "ms/image"):

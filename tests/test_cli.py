@@ -27,7 +27,7 @@ def test_every_choice_composes(model, data, conditioning):
 @pytest.mark.parametrize("experiment", sorted(p.stem for p in (CONF / "experiment").glob("*.yaml")))
 def test_every_experiment_composes_and_is_not_ignored(experiment):
     cfg = load_config("train", [f"experiment={experiment}"])
-    assert cfg.run_name == experiment
+    assert experiment in cfg.run_name
 
 
 @pytest.mark.parametrize("trainer", ["auto", "cpu", "gpu", "ddp"])

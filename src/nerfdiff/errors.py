@@ -1,5 +1,7 @@
 """The errors a person can mend: each message names what failed, what was expected and what to do."""
 
+from collections.abc import Collection
+
 
 class UserError(Exception):
     """Base of every error whose cause is input; entry points print it as one line, with no traceback."""
@@ -19,3 +21,10 @@ class CheckpointError(UserError, RuntimeError):
 
 class TrainingDiverged(UserError, RuntimeError):
     """Losses or gradients stayed non-finite for too many steps in a row."""
+
+
+def some(names: Collection[str], limit: int = 8) -> str:
+    """The first few of these names, and how many more there are."""
+    names = sorted(names)
+    more = f" and {len(names) - limit} more" if len(names) > limit else ""
+    return (", ".join(names[:limit]) or "none") + more

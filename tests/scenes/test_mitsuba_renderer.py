@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -5,12 +7,20 @@ import torch
 from nerfdiff.cameras import Cameras
 from nerfdiff.errors import ConfigError
 from nerfdiff.scenes.cars import build_car
+from nerfdiff.scenes.colour import linear_to_srgb8, rgba, srgb_to_linear
 from nerfdiff.scenes.mesh import Model, box
-from nerfdiff.scenes.mitsuba_renderer import MitsubaRenderer, linear_to_srgb8, resolve_variant, srgb_to_linear
+from nerfdiff.scenes.mitsuba_model import ModelWorld
+from nerfdiff.scenes.mitsuba_renderer import Film, MitsubaRenderer, resolve_variant, robust_mean
 from nerfdiff.scenes.poses import look_at_origin, random_sphere
+from nerfdiff.scenes.texture import Texture
 
 SIZE = 48
 HALF = np.array([0.30, 0.20, 0.10])
+
+
+def render(model, c2w, seed, size=SIZE, samples=4):
+    film = Film(size, size, np.rad2deg(2 * np.arctan(64 / 131.25)), samples)
+    return MitsubaRenderer("scalar_rgb", film).render(ModelWorld(model), c2w, seed)
 
 
 def cameras(c2w):
@@ -31,7 +41,7 @@ def car(poses):
     next_to = look_at_origin(1.3 * np.array([np.cos(0.5) * np.cos(-1.2), np.cos(0.5) * np.sin(-1.2), np.sin(0.5)]))
     c2w = np.stack([near, next_to, *poses])
     model = build_car(np.random.default_rng(11), {"sedan": 1.0})
-    return model, c2w, MitsubaRenderer("scalar_rgb", SIZE, 4).render(model, c2w, 0)
+    return model, c2w, render(model, c2w, 0)
 
 
 def box_depth(c2w):
@@ -47,7 +57,7 @@ def box_depth(c2w):
 
 def test_depth_and_mask_are_those_of_rays_through_pixel_centres(poses):
     model = Model("box", (box("box", (0, 0, 0), 2 * HALF, (0.4, 0.4, 0.4)),))
-    views = MitsubaRenderer("scalar_rgb", SIZE, 1).render(model, poses, 0)
+    views = render(model, poses, 0, samples=1)
     for k, pose in enumerate(poses):
         depth, close = box_depth(pose)
         assert (depth > 0).sum() > 100
@@ -59,7 +69,7 @@ def test_a_marked_corner_appears_where_cameras_project_it(poses):
     corner = np.array([0.25, -0.15, 0.12])
     marker = box("marker", corner, (0.05, 0.05, 0.05), (0.9, 0.02, 0.02))
     body = box("body", (0, 0, 0), 2 * HALF * [1, 1, 0.9], (0.05, 0.05, 0.6))
-    views = MitsubaRenderer("scalar_rgb", SIZE, 64).render(Model("marked", (body, marker)), poses, 0)
+    views = render(Model("marked", (body, marker)), poses, 0, samples=64)
     pixels, depth = cameras(poses).project(torch.from_numpy(corner).expand(len(poses), 1, 3))
     seen = 0
     for k in range(len(poses)):
@@ -80,7 +90,7 @@ def test_silhouette_in_colour_agrees_with_the_projected_outline_to_a_fraction_of
     # A dark square of 0.2 × 0.2 facing the camera, half a pixel off centre: coverage is known exactly.
     pose = look_at_origin([0, -2.0, 0])
     plate = box("plate", (0.013, 0, -0.007), (0.2, 0.001, 0.2), (0.0, 0.0, 0.0))
-    rgb = MitsubaRenderer("scalar_rgb", SIZE, 1024).render(Model("plate", (plate,)), pose[None], 0).rgb[0]
+    rgb = render(Model("plate", (plate,)), pose[None], 0, samples=1024).rgb[0]
     cover = 1 - srgb_to_linear(rgb[..., 0] / 255)
     row, column = np.indices(cover.shape) + 0.5
     focal = 131.25 / 128 * SIZE
@@ -142,9 +152,8 @@ def test_headlights_and_tail_lights_appear_where_cameras_project_them(car):
 
 
 def test_the_same_seed_gives_the_same_noise_and_another_seed_another(poses):
-    renderer = MitsubaRenderer("scalar_rgb", 16, 4)
     model = build_car(np.random.default_rng(1), {"suv": 1.0})
-    a, b, c = (renderer.render(model, poses[:1], seed).rgb for seed in (3, 3, 4))
+    a, b, c = (render(model, poses[:1], seed, 16).rgb for seed in (3, 3, 4))
     assert np.array_equal(a, b)
     assert not np.array_equal(a, c)
 
@@ -160,3 +169,41 @@ def test_srgb_conversion_against_known_values_and_its_own_inverse():
 def test_an_unknown_variant_is_refused_with_the_known_ones():
     with pytest.raises(ConfigError, match="scalar_rgb"):
         resolve_variant("opengl")
+
+
+def test_rgba_holds_straight_colours_that_composite_to_the_image_on_white():
+    alpha = np.array([[0.0, 0.25, 1.0]])
+    radiance = np.array([[[0.0, 0, 0], [0.125, 0.05, 0.0], [0.2159, 1.0, 0.0]]])
+    values = rgba(radiance, alpha, 8)
+    assert values.dtype == np.uint8 and values[0].tolist() == [[0, 0, 0, 0], [188, 124, 0, 64], [128, 255, 0, 255]]
+    deep = rgba(radiance, alpha, 16)
+    assert deep.dtype == np.uint16 and deep[0, 1, 3] == round(0.25 * 65535)
+    assert np.abs(deep / 257 - values).max() < 0.51
+
+
+def test_light_that_only_one_pass_found_is_toned_down_and_coverage_is_not():
+    passes = [np.full((2, 2, 4), 0.5) for _ in range(4)]
+    passes[2][0, 0, :3], passes[1][1, 1, 3] = 80.0, 1.0
+    mean = robust_mean(passes)
+    assert mean[0, 0, 0] < 0.6 and np.allclose(mean[0, 1], 0.5) and mean[1, 1, 3] == pytest.approx(0.625)
+
+
+def test_stripes_lie_where_box_projection_puts_them():
+    # One repeat, two bright stripes, over a top face of 1.2 × 0.9 whose corner is where the pattern starts.
+    stripes = Texture("stripes", (0.9, 0.9, 0.9), (1.2, 1.2))
+    part = replace(box("top", (0, 0, 0), (1.2, 0.9, 0.02), (0.05, 0.05, 0.05)), texture=stripes)
+    rgb = render(Model("striped", (part,)), look_at_origin([0, 0, 2.01])[None], 0, samples=64).rgb[0]
+    bright = stripes.pixels(part.colour)[0, :, 0] > 128
+    starts = np.flatnonzero(bright & ~np.roll(bright, 1)) / len(bright)
+    ends = (np.flatnonzero(bright & ~np.roll(bright, -1)) + 1) / len(bright)
+    assert np.allclose(starts, [0, 0.5])
+    middles = (starts + ends) / 2 * 1.2 - 0.6
+    # Straight above, x points to the left of the image.
+    columns = SIZE / 2 - 131.25 / 128 * SIZE * middles / 2.0
+    row = rgb[SIZE // 2, :, 0].astype(int)
+    assert all(row[int(c)] > 200 for c in columns)
+    between = SIZE / 2 - 131.25 / 128 * SIZE * (np.array([0.4, 0.9]) * 1.2 - 0.6) / 2.0
+    assert all(row[int(c)] < 100 for c in between)
+    # They run along y.
+    for column in (*columns, *between):
+        assert np.ptp(rgb[SIZE // 2 - 6 : SIZE // 2 + 6, int(column), 0].astype(int)) < 12

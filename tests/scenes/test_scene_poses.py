@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from nerfdiff.scenes.poses import intrinsics_text, look_at_origin, pose_text, random_sphere, srn_spiral
+from nerfdiff.scenes.kinds.srn import intrinsics_text, pose_text
+from nerfdiff.scenes.poses import look_at, look_at_origin, random_sphere, srn_spiral
 
 # Pose files 0, 1, 64, 100 and 250 of a test car rendered on the spiral of SRN-ShapeNet.
 # fmt: off
@@ -84,3 +85,10 @@ def test_elevations_bound_the_training_views_evenly():
     heights = random_sphere(2.0, 4000, np.random.default_rng(3), (0.0, 30.0))[:, 2, 3] / 2
     assert heights.min() >= 0 and heights.max() <= 0.5
     assert abs(heights.mean() - 0.25) < 0.01
+
+
+def test_looking_at_another_point_is_looking_at_the_origin_moved_there():
+    target, arm = np.array([0.3, -2.0, 0.7]), np.array([1.0, 2.0, -0.5])
+    c2w = look_at(target + arm, target)
+    assert np.array_equal(c2w[:3, :3], look_at_origin(arm)[:3, :3])
+    assert np.allclose(c2w[:3, 3] + c2w[:3, 2] * np.linalg.norm(arm), target)

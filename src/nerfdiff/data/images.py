@@ -1,9 +1,11 @@
 """Image files to 8-bit RGB on white, and their resizing."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Integer, UInt8
 from PIL import Image
 
 from nerfdiff.errors import DataError
@@ -35,6 +37,43 @@ def decode_mask(path: Path) -> Bool[np.ndarray, "height width"]:
     return np.asarray(_open(path).convert("L")) > 127
 
 
+def stored_size(path: Path) -> tuple[int, int]:
+    """(height, width) by the file's header, without decoding.
+
+    Raises:
+        DataError: the file is missing or no image.
+    """
+    with _readable(path), Image.open(path) as image:
+        return image.height, image.width
+
+
+def decode_alpha(path: Path) -> Bool[np.ndarray, "height width"] | None:
+    """Where an image is more than half opaque; None where it has no transparency.
+
+    Raises:
+        DataError: as `decode`.
+    """
+    image = _open(path)
+    if not image.has_transparency_data:
+        return None
+    return np.asarray(image.convert("RGBA"))[..., 3] > 127
+
+
+def decode_levels(path: Path) -> Integer[np.ndarray, "height width"]:
+    """Decode the one channel of an image as it is stored: labels, palette indices, or depths of 16 bits.
+
+    Raises:
+        DataError: as `decode`, or the image has several channels or no whole numbers.
+    """
+    image = _open(path)
+    levels = np.asarray(image)
+    if levels.dtype == bool:
+        levels = levels.astype(np.uint8)
+    if levels.ndim != 2 or not np.issubdtype(levels.dtype, np.integer):
+        raise DataError(f"{path}: expected an image of one channel of whole numbers, found mode {image.mode}")
+    return levels
+
+
 def resize(
     image: UInt8[np.ndarray, "height width 3"], size: tuple[int, int]
 ) -> UInt8[np.ndarray, "new_height new_width 3"]:
@@ -60,10 +99,16 @@ def resize_nearest(
 
 
 def _open(path: Path) -> Image.Image:
+    with _readable(path), Image.open(path) as image:
+        image.load()
+        return image
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """What Pillow raises on missing and damaged files, as one error that names the file."""
     try:
-        with Image.open(path) as image:
-            image.load()
-            return image
+        yield
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such image") from error
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:

@@ -9,6 +9,8 @@ from nerfdiff.errors import DataError
 
 RIGID_TOLERANCE = 1e-3
 """Largest deviation of R·Rᵀ from the identity that rounding in a text file explains."""
+MAX_POSITION = 1e12
+"""Coordinates whose powers single precision still holds."""
 
 
 def read_numbers(path: Path, counts: tuple[int, ...], what: str) -> Float[np.ndarray, " count"]:
@@ -49,16 +51,37 @@ def read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
         DataError: as `read_numbers`, or the matrix is not a rotation and a translation.
     """
     pose = read_numbers(path, (16,), "a row-major 4x4 pose").reshape(4, 4)
+    check_rigid(pose, path)
+    return pose
+
+
+def check_rigid(pose: Float[np.ndarray, "4 4"], where: str | Path) -> None:
+    """Refuse a matrix that is not a rotation and a translation.
+
+    Args:
+        where: the file, and the key within it, for the message.
+
+    Raises:
+        DataError: entries are NaN, infinite or huge, or the matrix scales, shears or mirrors.
+    """
+    if not np.isfinite(pose).all():
+        raise DataError(f"{where}: expected a 4x4 pose of finite numbers, found NaN or infinity")
     rotation = pose[:3, :3]
-    deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if deviation > RIGID_TOLERANCE or np.abs(pose[3] - [0, 0, 0, 1]).max() > RIGID_TOLERANCE:
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    # negated, so that the NaN of an overflow is refused
+    if not deviation <= RIGID_TOLERANCE or np.abs(pose[3] - [0, 0, 0, 1]).max() > RIGID_TOLERANCE:
         raise DataError(
-            f"{path}: the pose is not rigid (R·Rᵀ is off the identity by {deviation:.2g}, "
+            f"{where}: the pose is not rigid (R·Rᵀ is off the identity by {deviation:.2g}, "
             f"last row {pose[3].tolist()}); expected a rotation and a translation, with no scale"
         )
     if np.linalg.det(rotation) < 0:
-        raise DataError(f"{path}: the pose mirrors space (det R < 0); expected a right-handed rotation")
-    return pose
+        raise DataError(f"{where}: the pose mirrors space (det R < 0); expected a right-handed rotation")
+    if np.abs(pose[:3, 3]).max() > MAX_POSITION:
+        raise DataError(
+            f"{where}: the position {pose[:3, 3].tolist()} is too far from the origin for single precision; expected a "
+            "world that is centred near the scene"
+        )
 
 
 def inverse_pose(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:

@@ -7,10 +7,9 @@ Poses are camera-to-world with OpenCV axes in a z-up world, so nothing needs con
 """
 
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -20,10 +19,12 @@ from nerfdiff.cameras import Cameras
 from nerfdiff.data import images
 from nerfdiff.data.fingerprint import fingerprint_folders
 from nerfdiff.data.framing import Framing
+from nerfdiff.data.npz_files import read_depth
 from nerfdiff.data.posed_files import inverse_pose, read_pose
 from nerfdiff.data.scene import MissingSplit, Scene
 from nerfdiff.data.srn_intrinsics import SceneIntrinsics, read_view_intrinsics
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.data.view_stack import stack_pixels
+from nerfdiff.errors import ConfigError, DataError, some
 
 SPLITS = ("train", "val", "test")
 PARENTS = ("", "srn_{category}", "srn_{category}/srn_{category}")
@@ -81,7 +82,7 @@ class SRNReader:
         )
         if not self.scenes:
             raise DataError(f"{self.folder}: the {split} split is empty; expected one folder per scene in it")
-        self.identity = f"srn {self.folder.resolve()} {self.framing}"
+        self.identity = f"srn {self.folder.resolve()} {self.framing} bounds {self.near} {self.far}"
         self._listed: dict[int, _Folder] = {}
 
     def __len__(self) -> int:
@@ -103,27 +104,21 @@ class SRNReader:
         names = tuple(folder.views[p] for p in positions)
         stored = [images.decode(folder.rgb[p]) for p in positions]
         shared = _shared_intrinsics(folder.path)
-        K = self._intrinsics(folder, names, [image.shape[:2] for image in stored], shared)
-        stored = [self.framing.image(image) for image in stored]
-        for position, image in zip(positions, stored, strict=True):
-            if image.shape != stored[0].shape:
-                raise DataError(
-                    f"{folder.rgb[position]}: {image.shape[0]}x{image.shape[1]} pixels, other views of the "
-                    f"scene have {stored[0].shape[0]}x{stored[0].shape[1]}; set data.image_size to resize all"
-                )
-        height, width = stored[0].shape[:2]
+        sizes = [image.shape[:2] for image in stored]
+        K = self._intrinsics(folder, names, sizes, shared)
+        pixels = stack_pixels([self.framing.image(image) for image in stored], [folder.rgb[p] for p in positions])
         poses = [read_pose(folder.path / "pose" / f"{name}.txt") for name in names]
         if shared is not None and shared.world2cam:
             poses = [inverse_pose(pose) for pose in poses]
         return Scene(
             id=self.scenes[index],
             views=names,
-            pixels=torch.from_numpy(np.stack(stored)).permute(0, 3, 1, 2).contiguous(),
-            cameras=Cameras(torch.from_numpy(np.stack(poses)).float(), torch.from_numpy(K).float(), height, width),
+            pixels=pixels,
+            cameras=Cameras(torch.from_numpy(np.stack(poses)).float(), torch.from_numpy(K).float(), *pixels.shape[-2:]),
             near=self.near,
             far=self.far,
-            mask=self._truth(folder, names, "mask") if truth else None,
-            depth=self._truth(folder, names, "depth") if truth else None,
+            mask=self._truth(folder, names, sizes, "mask") if truth else None,
+            depth=self._truth(folder, names, sizes, "depth") if truth else None,
         )
 
     def _list(self, index: int) -> _Folder:
@@ -134,8 +129,8 @@ class SRNReader:
             if rgb.keys() != pose.keys():
                 raise DataError(
                     f"{path}: {len(rgb)} images in rgb/ and {len(pose)} poses in pose/ do not match by name; "
-                    f"images without a pose: {_some(rgb.keys() - pose.keys())}; "
-                    f"poses without an image: {_some(pose.keys() - rgb.keys())}"
+                    f"images without a pose: {some(rgb.keys() - pose.keys())}; "
+                    f"poses without an image: {some(pose.keys() - rgb.keys())}"
                 )
             self._listed[index] = _Folder(path, tuple(sorted(rgb)), tuple(rgb[name] for name in sorted(rgb)))
         return self._listed[index]
@@ -155,13 +150,19 @@ class SRNReader:
             K = [read_view_intrinsics(f, *size) for f, size in zip(files, sizes, strict=True)]
         return np.stack([self.framing.K(k, *size) for k, size in zip(K, sizes, strict=True)])
 
-    def _truth(self, folder: _Folder, names: Sequence[str], kind: str):
+    def _truth(self, folder: _Folder, names: Sequence[str], sizes: Sequence[tuple[int, int]], kind: str):
         """`mask/<view>.png` or `depth/<view>.npz` of generated scenes; None where the folder is not there."""
         if not (folder.path / kind).is_dir():
             return None
-        read, suffix = (images.decode_mask, "png") if kind == "mask" else (_read_depth, "npz")
-        values = [read(folder.path / kind / f"{name}.{suffix}") for name in names]
-        return torch.from_numpy(np.stack([self.framing.values(value) for value in values]))
+        read, suffix = (images.decode_mask, "png") if kind == "mask" else (read_depth, "npz")
+        values = []
+        for name, size in zip(names, sizes, strict=True):
+            file = folder.path / kind / f"{name}.{suffix}"
+            value = read(file)
+            if value.shape != size:
+                raise DataError(f"{file}: shape {value.shape[0]}x{value.shape[1]}, its image has {size[0]}x{size[1]}")
+            values.append(self.framing.values(value))
+        return torch.from_numpy(np.stack(values))
 
 
 def _shared_intrinsics(scene: Path) -> SceneIntrinsics | None:
@@ -187,9 +188,7 @@ def _find_split(root: Path, category: str, split: str) -> Path:
     found = sorted(entry.name for entry in root.iterdir())
     if not found:
         raise DataError(f"{root}: the folder is empty; expected one of {looked_for} in it")
-    raise MissingSplit(
-        f"{root}: no {split} split of SRN {category}; looked for {looked_for}; found only {_some(found)}"
-    )
+    raise MissingSplit(f"{root}: no {split} split of SRN {category}; looked for {looked_for}; found only {some(found)}")
 
 
 def _files_by_stem(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
@@ -203,20 +202,3 @@ def _files_by_stem(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
     if len(by_stem) < len(files):
         raise DataError(f"{folder}: {len(files) - len(by_stem)} views are there twice, under several suffixes")
     return by_stem
-
-
-def _read_depth(path: Path) -> Float[np.ndarray, "height width"]:
-    try:
-        with np.load(path) as arrays:
-            depth = arrays["depth"].astype(np.float32)
-    except (OSError, KeyError, ValueError, BadZipFile) as error:
-        raise DataError(f"{path}: expected an npz file with an array 'depth' ({error})") from error
-    if depth.ndim != 2 or not np.isfinite(depth).all():
-        raise DataError(f"{path}: expected a finite [height, width] depth, found shape {depth.shape}")
-    return depth
-
-
-def _some(names: Collection[str], limit: int = 8) -> str:
-    names = sorted(names)
-    more = f" and {len(names) - limit} more" if len(names) > limit else ""
-    return (", ".join(names[:limit]) or "none") + more

@@ -11,6 +11,8 @@ from nerfdiff.errors import DataError
 
 ASPECT_TOLERANCE = 0.02
 """How far the two scale factors may differ by rounding of the image size (640×480 stored as 107×80)."""
+FOCAL_RANGE = (1e-3, 1e5)
+"""Of focal lengths relative to the image's width: fields of view of 179.9° and of 2 seconds of arc."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +49,10 @@ class SceneIntrinsics:
             world2cam = bool([["0"], ["1"]].index(lines[4])) if len(lines) > 4 else False
         except (IndexError, ValueError) as error:
             raise DataError(f"{path}: {form} ({error})") from error
-        if not (np.isfinite(f) and f > 0 and 0 < cx < width < np.inf and 0 < cy < height < np.inf):
+        if not (0 < cx < width < np.inf and 0 < cy < height < np.inf and is_focal(f, width)):
             raise DataError(
                 f"{path}: f = {f:g}, (cx, cy) = ({cx:g}, {cy:g}) and a size of {height:g}x{width:g} are no "
-                "pinhole; expected f > 0 and a principal point inside the image"
+                "pinhole; expected f > 0 in pixels and a principal point inside the image"
             )
         return SceneIntrinsics(path, f, cx, cy, height, width, world2cam)
 
@@ -69,6 +71,11 @@ class SceneIntrinsics:
         return np.array([[self.f * sx, 0, self.cx * sx], [0, self.f * sy, self.cy * sy], [0, 0, 1]])
 
 
+def is_focal(f: float, width: float) -> bool:
+    """Whether a lens can have a focal length of `f` pixels in images of this width."""
+    return bool(FOCAL_RANGE[0] * width < f < FOCAL_RANGE[1] * width)
+
+
 def read_view_intrinsics(path: Path, height: int, width: int) -> Float[np.ndarray, "3 3"]:
     """`intrinsics/<view>.txt`: a 3×3 K of the stored image.
 
@@ -76,7 +83,7 @@ def read_view_intrinsics(path: Path, height: int, width: int) -> Float[np.ndarra
         DataError: the numbers are no K of an image of `height` × `width`.
     """
     K = read_numbers(path, (9,), "a row-major 3x3 K").reshape(3, 3)
-    pinhole = K[0, 0] > 0 and K[1, 1] > 0 and 0 < K[0, 2] < width and 0 < K[1, 2] < height
+    pinhole = is_focal(K[0, 0], width) and is_focal(K[1, 1], width) and 0 < K[0, 2] < width and 0 < K[1, 2] < height
     if not pinhole or K[0, 1] or K[1, 0] or not np.array_equal(K[2], [0, 0, 1]):
         raise DataError(
             f"{path}: {K.tolist()} is no K of a {height}x{width} image; expected [[fx, 0, cx], [0, fy, cy], "

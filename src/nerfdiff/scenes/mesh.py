@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int, Real
 
-Colour = tuple[float, float, float]
+from nerfdiff.scenes.texture import Colour, Texture
+
 Point = Sequence[int | float] | Real[np.ndarray, "3"]
 Numbers = Sequence[int | float] | Real[np.ndarray, "numbers"]
 FINISHES = ("matte", "paint", "glass")
@@ -18,7 +19,7 @@ FINISHES = ("matte", "paint", "glass")
 
 @dataclass(frozen=True)
 class Part:
-    """One closed surface of one colour.
+    """One closed surface of one colour or texture.
 
     Args:
         name: what it is (`headlight`, `seat`, …); several parts may share a name.
@@ -26,6 +27,7 @@ class Part:
         faces: triangles, counter-clockwise seen from outside.
         colour: sRGB in [0, 1].
         finish: one of `FINISHES`; says which reflectance model the renderer uses.
+        texture: a pattern over the colour.
     """
 
     name: str
@@ -33,6 +35,7 @@ class Part:
     faces: Int[np.ndarray, "m 3"]
     colour: Colour
     finish: str = "matte"
+    texture: Texture | None = None
 
     def volume(self) -> float:
         """Signed volume: positive where the faces point outwards."""
@@ -65,7 +68,15 @@ class Model:
         """Centred on the origin, the bounding box's diagonal being 1 (ShapeNet's convention)."""
         low, high = self.bounds()
         centre, scale = (low + high) / 2, 1 / np.linalg.norm(high - low)
-        return replace(self, parts=tuple(replace(p, vertices=(p.vertices - centre) * scale) for p in self.parts))
+        parts = (
+            replace(p, vertices=(p.vertices - centre) * scale, texture=p.texture and p.texture.scaled(float(scale)))
+            for p in self.parts
+        )
+        return replace(self, parts=tuple(parts))
+
+    def moved(self, offset: Point) -> "Model":
+        """The same object elsewhere."""
+        return replace(self, parts=tuple(replace(p, vertices=p.vertices + np.asarray(offset)) for p in self.parts))
 
     def named(self, name: str) -> tuple[Part, ...]:
         """The parts of this name."""

@@ -1,28 +1,71 @@
-"""Render a `Model` with Mitsuba 3. Mitsuba is imported on first use: geometry and layout do not need it."""
+"""Render a world with Mitsuba 3. Mitsuba is imported on first use: geometry and layouts do not need it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from nerfdiff.errors import ConfigError
-from nerfdiff.scenes.mesh import Colour, Model, Part
-from nerfdiff.scenes.poses import FOCAL_PER_PIXEL
+from nerfdiff.scenes.colour import linear_to_srgb8
+
+
+@dataclass(frozen=True)
+class Film:
+    """How images are taken.
+
+    Args:
+        height, width: pixels.
+        fov: angle of view across the width, in degrees.
+        samples_per_pixel: for colour; depth and labels take the one ray through the pixel's centre.
+        max_depth: longest light path; 2 is direct light, 3 adds one bounce between surfaces.
+        passes: into how many renderings the samples are shared. With several, a pass far brighter than their
+            median is toned down: light focused by metal is found too rarely to average out.
+    """
+
+    height: int
+    width: int
+    fov: float
+    samples_per_pixel: int
+    max_depth: int = 3
+    passes: int = 1
+
+
+@runtime_checkable
+class World(Protocol):
+    """What is rendered."""
+
+    def entries(self, mi: Any) -> dict[str, Any]:
+        """Lights and shapes of a Mitsuba scene, by name."""
+
+    def labels(self, points: Float[np.ndarray, "*image 3"]) -> Int[np.ndarray, "*image"]:
+        """What surface points belong to: 0 is background, objects count from 1."""
 
 
 @dataclass(frozen=True)
 class Views:
-    """Rendered views of one object.
+    """Rendered views of one world.
 
     Args:
-        rgb: on white.
+        radiance: linear colour, multiplied by `alpha`.
+        alpha: how much of the pixel is covered by shapes.
         depth: distance along the camera's z axis where the ray through a pixel's centre hits, else 0.
         mask: whether that ray hits.
+        labels: what that ray hits, as `World.labels`; 0 where it hits nothing.
     """
 
-    rgb: UInt8[np.ndarray, "views height width 3"]
+    radiance: Float[np.ndarray, "views height width 3"]
+    alpha: Float[np.ndarray, "views height width"]
     depth: Float[np.ndarray, "views height width"]
     mask: Bool[np.ndarray, "views height width"]
+    labels: Int[np.ndarray, "views height width"]
+
+    @cached_property
+    def rgb(self) -> UInt8[np.ndarray, "views height width 3"]:
+        """Colours on white."""
+        return linear_to_srgb8(self.radiance + (1 - self.alpha[..., None]))
 
 
 def resolve_variant(variant: str) -> str:
@@ -41,17 +84,14 @@ def resolve_variant(variant: str) -> str:
     return variant
 
 
-def srgb_to_linear(value: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """IEC 61966-2-1, from [0, 1] to [0, 1]."""
-    value = np.asarray(value)
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-
-
-def linear_to_srgb8(value: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
-    """IEC 61966-2-1, clipped to [0, 1] and rounded to 8 bits."""
-    value = np.clip(value, 0, 1)
-    encoded = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
-    return np.round(encoded * 255).astype(np.uint8)
+def robust_mean(passes: Sequence[Float[np.ndarray, "height width 4"]]) -> Float[np.ndarray, "height width 4"]:
+    """The mean of renderings of one image, colours being limited to 1.5 times their median over the passes."""
+    if len(passes) == 1:
+        return passes[0]
+    stack = np.stack(passes)
+    limit = 1.5 * np.median(stack, axis=0) + 0.02
+    limit[..., 3] = np.inf
+    return np.minimum(stack, limit).mean(axis=0)
 
 
 class MitsubaRenderer:
@@ -59,37 +99,39 @@ class MitsubaRenderer:
 
     Args:
         variant: a Mitsuba variant, not `auto`.
-        resolution: pixels per side.
-        samples_per_pixel: for colour; depth and mask take the one ray through the pixel's centre.
+        film: how images are taken.
     """
 
-    def __init__(self, variant: str, resolution: int, samples_per_pixel: int):
+    def __init__(self, variant: str, film: Film):
         import drjit
         import mitsuba
 
         if mitsuba.variant() != variant:
             mitsuba.set_variant(variant)
+        # The sampler would say at every view that it rounds the number of samples up.
+        mitsuba.set_log_level(mitsuba.LogLevel.Error)
         drjit.set_thread_count(1)
         self.mi = mitsuba
-        self.resolution = resolution
-        self.samples_per_pixel = samples_per_pixel
-        # hide_emitters leaves the background transparent; depth 3 is one bounce between surfaces.
-        self.colour = mitsuba.load_dict({"type": "path", "max_depth": 3, "hide_emitters": True})
+        self.film = film
+        # hide_emitters leaves the background transparent.
+        self.colour = mitsuba.load_dict({"type": "path", "max_depth": film.max_depth, "hide_emitters": True})
         self.first_hit = mitsuba.load_dict({"type": "aov", "aovs": "p:position,n:geo_normal"})
 
-    def render(self, model: Model, c2w: Float[np.ndarray, "views 4 4"], seed: int) -> Views:
-        """Render `model` from every pose; `seed` fixes the noise."""
-        scene = self._scene(model)
-        rgb, depth, mask = zip(*(self._view(scene, pose, seed + 7919 * k) for k, pose in enumerate(c2w)), strict=True)
-        return Views(np.stack(rgb), np.stack(depth), np.stack(mask))
+    def render(self, world: World, c2w: Float[np.ndarray, "views 4 4"], seed: int) -> Views:
+        """Render `world` from every pose; `seed` fixes the noise."""
+        scene = self.mi.load_dict({"type": "scene", **world.entries(self.mi)}, parallel=False)
+        views = (self._view(scene, pose, seed + 7919 * k) for k, pose in enumerate(c2w))
+        radiance, alpha, depth, mask, position = (np.stack(values) for values in zip(*views, strict=True))
+        return Views(radiance, alpha, depth, mask, np.where(mask, world.labels(position), 0))
 
     def _view(self, scene, pose, seed):
-        mi = self.mi
-        seed %= 2**32
-        sensor = self._sensor(pose, {"type": "multijitter", "sample_count": self.samples_per_pixel})
-        image = np.array(mi.render(scene, sensor=sensor, integrator=self.colour, seed=seed, spp=self.samples_per_pixel))
-        alpha = np.clip(image[..., 3:4], 0, 1)
-        rgb = linear_to_srgb8(np.clip(image[..., :3], 0, None) + (1 - alpha))
+        mi, samples = self.mi, self.film.samples_per_pixel // self.film.passes
+        sensor = self._sensor(pose, {"type": "multijitter", "sample_count": samples})
+        seeds = [(seed + 104729 * k) % 2**32 for k in range(self.film.passes)]
+        image = robust_mean(
+            [np.array(mi.render(scene, sensor=sensor, integrator=self.colour, seed=s, spp=samples)) for s in seeds]
+        )
+        alpha = np.clip(image[..., 3], 0, 1)
 
         # One stratum without jitter is the pixel's centre, and a box filter keeps pixels apart.
         centre = self._sensor(pose, {"type": "stratified", "sample_count": 1, "jitter": False})
@@ -97,15 +139,15 @@ class MitsubaRenderer:
         position, normal = hit[..., -6:-3], hit[..., -3:]
         mask = (normal**2).sum(-1) > 0.5
         depth = np.where(mask, (position.astype(np.float64) - pose[:3, 3]) @ pose[:3, 2], 0.0)
-        return rgb, depth, mask
+        return np.clip(image[..., :3], 0, None), alpha, depth, mask, position
 
     def _sensor(self, pose, sampler):
-        mi = self.mi
+        mi, film = self.mi, self.film
         centre, forward, up = pose[:3, 3], pose[:3, 2], -pose[:3, 1]
         return mi.load_dict(
             {
                 "type": "perspective",
-                "fov": float(np.rad2deg(2 * np.arctan(0.5 / FOCAL_PER_PIXEL))),
+                "fov": film.fov,
                 "fov_axis": "x",
                 "near_clip": 0.01,
                 "far_clip": 100.0,
@@ -114,8 +156,8 @@ class MitsubaRenderer:
                 ),
                 "film": {
                     "type": "hdrfilm",
-                    "width": self.resolution,
-                    "height": self.resolution,
+                    "width": film.width,
+                    "height": film.height,
                     "pixel_format": "rgba",
                     "component_format": "float32",
                     "rfilter": {"type": "box"},
@@ -123,52 +165,3 @@ class MitsubaRenderer:
                 "sampler": sampler,
             }
         )
-
-    def _scene(self, model: Model):
-        mi = self.mi
-        entries = {
-            "type": "scene",
-            # A bright sky all around plus a soft-edged sun from above and the front right: tops are
-            # lightest, undersides darkest, and little depends on the viewing direction.
-            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.70}},
-            "sun": {
-                "type": "directional",
-                "direction": [-0.35, 0.45, -0.82],
-                "irradiance": {"type": "rgb", "value": 1.5},
-            },
-        }
-        groups: dict[tuple, list[Part]] = {}
-        for part in model.parts:
-            groups.setdefault((part.finish, part.colour), []).append(part)
-        for k, ((finish, colour), parts) in enumerate(groups.items()):
-            entries[f"mesh_{k:03d}"] = self._mesh(parts, self._bsdf(finish, colour))
-        return mi.load_dict(entries)
-
-    def _mesh(self, parts: list[Part], bsdf: dict):
-        mi = self.mi
-        offsets = np.cumsum([0] + [len(p.vertices) for p in parts[:-1]])
-        vertices = np.concatenate([p.vertices for p in parts])
-        faces = np.concatenate([p.faces + o for p, o in zip(parts, offsets, strict=True)])
-
-        props = mi.Properties()
-        props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": bsdf})
-        props["face_normals"] = True
-        mesh = mi.Mesh("parts", len(vertices), len(faces), props=props)
-        params = mi.traverse(mesh)
-        params["vertex_positions"] = type(params["vertex_positions"])(vertices.astype(np.float32).ravel())
-        params["faces"] = type(params["faces"])(faces.astype(np.uint32).ravel())
-        params.update()
-        return mesh
-
-    @staticmethod
-    def _bsdf(finish: str, colour: Colour) -> dict:
-        reflectance = {"type": "rgb", "value": srgb_to_linear(np.array(colour)).tolist()}
-        if finish == "matte":
-            return {"type": "diffuse", "reflectance": reflectance}
-        # A clear coat with a mild index of refraction: a hint of sheen over a diffuse colour.
-        return {
-            "type": "plastic",
-            "diffuse_reflectance": reflectance,
-            "int_ior": 1.30 if finish == "paint" else 1.45,
-            "specular_reflectance": {"type": "rgb", "value": 0.5 if finish == "paint" else 0.9},
-        }

@@ -10,10 +10,10 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
 
 from nerfdiff.errors import DataError
+from nerfdiff.scenes.kinds.kind import SceneJob, SceneKind
 from nerfdiff.scenes.mitsuba_renderer import MitsubaRenderer
-from nerfdiff.scenes.scene_job import SceneJob
 
-_renderer: MitsubaRenderer | None = None
+_worker: tuple[SceneKind, MitsubaRenderer] | None = None
 
 
 def process_count(wanted: int | str, variant: str) -> int:
@@ -25,24 +25,27 @@ def process_count(wanted: int | str, variant: str) -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def render_all(jobs: Sequence[SceneJob], processes: int, renderer: tuple[str, int, int]) -> Iterator[int]:
+def render_all(kind: SceneKind, jobs: Sequence[SceneJob], processes: int, variant: str) -> Iterator[int]:
     """Render and write `jobs`; yields the number of images as each scene is complete.
 
     Args:
+        kind: makes the scenes.
         jobs: scenes, started in this order.
         processes: 1 renders in this process.
-        renderer: arguments of `MitsubaRenderer`.
+        variant: a Mitsuba variant, not `auto`.
 
     Raises:
         DataError: a scene cannot be written, or a worker process was killed.
     """
     if processes == 1:
-        alone = MitsubaRenderer(*renderer)
-        yield from (job.render(alone) for job in jobs)
+        alone = MitsubaRenderer(variant, kind.film)
+        for job in jobs:
+            kind.make(job, alone)
+            yield job.views
         return
     # spawn: Mitsuba's threads do not survive a fork.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, context, _start_worker, renderer) as pool:
+    with ProcessPoolExecutor(processes, context, _start_worker, (kind, variant)) as pool:
         futures = [pool.submit(_work, job) for job in jobs]
         try:
             for future in as_completed(futures):
@@ -55,12 +58,12 @@ def render_all(jobs: Sequence[SceneJob], processes: int, renderer: tuple[str, in
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _start_worker(variant: str, resolution: int, samples_per_pixel: int) -> None:
-    global _renderer
+def _start_worker(kind: SceneKind, variant: str) -> None:
+    global _worker
     # Ctrl-C is the parent's to handle; should the parent be killed, nobody is left to work for.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_leave_with_parent, daemon=True).start()
-    _renderer = MitsubaRenderer(variant, resolution, samples_per_pixel)
+    _worker = kind, MitsubaRenderer(variant, kind.film)
 
 
 def _leave_with_parent() -> None:
@@ -69,4 +72,6 @@ def _leave_with_parent() -> None:
 
 
 def _work(job: SceneJob) -> int:
-    return job.render(_renderer)
+    kind, renderer = _worker
+    kind.make(job, renderer)
+    return job.views

@@ -1,4 +1,4 @@
-"""Cameras of the SRN layout: OpenCV axes, cam2world, in a z-up world, looking at the origin.
+"""Cameras: OpenCV axes, cam2world, in a z-up world; those of SRN look at the origin.
 
 numpy in float64, so that workers that render need not load torch.
 """
@@ -29,6 +29,13 @@ def look_at_origin(centre: Sequence[int | float] | Real[np.ndarray, "3"]) -> Flo
     return c2w
 
 
+def look_at(centre: Real[np.ndarray, "3"], target: Real[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+    """cam2world of a camera at `centre` that looks at `target`, otherwise as `look_at_origin`."""
+    c2w = look_at_origin(np.asarray(centre, np.float64) - target)
+    c2w[:3, 3] = centre
+    return c2w
+
+
 def srn_spiral(radius: int | float, views: int = SPIRAL_VIEWS) -> Float[np.ndarray, "views 4 4"]:
     """The first `views` of the 251 test poses of SRN-ShapeNet, from the equator up to the pole."""
     k = np.arange(views)
@@ -52,14 +59,3 @@ def random_sphere(
     across = np.sqrt(1 - z**2)
     directions = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=1)
     return np.stack([look_at_origin(radius * d) for d in directions])
-
-
-def intrinsics_text(resolution: int) -> str:
-    """`intrinsics.txt` of SRN: f cx cy, two unused lines, height and width."""
-    focal, centre = FOCAL_PER_PIXEL * resolution, resolution / 2
-    return f"{focal:f} {centre:f} {centre:f} 0.\n0. 0. 0.\n1.\n{resolution} {resolution}\n"
-
-
-def pose_text(c2w: Float[np.ndarray, "4 4"]) -> str:
-    """A pose file: 16 numbers on one line, row by row."""
-    return " ".join(repr(float(v)) for v in np.asarray(c2w, np.float64).ravel())

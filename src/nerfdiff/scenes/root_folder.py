@@ -1,16 +1,4 @@
-"""Write rendered scenes in the SRN layout, with depth and mask beside the colours.
-
-    <root>/cars_train|cars_val|cars_test/<id>/
-        intrinsics.txt  scene.json
-        rgb/000000.png    8-bit RGB on white
-        pose/000000.txt   cam2world, OpenCV axes
-        depth/000000.npz  array `depth`, float32: distance along z in scene units, 0 where nothing was hit
-        mask/000000.png   8-bit: 255 where the ray through the pixel's centre hits, else 0
-    <root>/chairs_train/chairs_2.0_train/<id>/…    nested in training, as the public archive has it
-    <root>/scenes.json    what the folder was made with
-
-A scene's folder appears under its name only when it is complete.
-"""
+"""The folder a data set is made in: one run at a time, one set of parameters, only complete scenes."""
 
 import fcntl
 import json
@@ -21,58 +9,27 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-from PIL import Image
-
 from nerfdiff.errors import ConfigError, DataError
-from nerfdiff.scenes.mitsuba_renderer import Views
-from nerfdiff.scenes.poses import intrinsics_text, pose_text
 
 MANIFEST = "scenes.json"
-SPLITS = ("train", "val", "test")
 
 
-def split_folder(category: str, split: str) -> str:
-    """Where SRN keeps a split, relative to the dataset's root."""
-    if (category, split) == ("chairs", "train"):
-        return "chairs_train/chairs_2.0_train"
-    return f"{category}_{split}"
-
-
-def scene_folder(root: Path, category: str, split: str, index: int) -> Path:
-    """The folder of scene `index` of a split."""
-    return Path(root) / split_folder(category, split) / f"{index:06d}"
-
-
-def write_scene(
-    root: Path, folder: Path, views: Views, c2w: Float[np.ndarray, "views 4 4"], facts: dict[str, Any]
-) -> None:
-    """Write one scene completely, then move it to `folder`; `facts` go into its `scene.json`.
-
-    Half-written scenes stay under `<root>/.partial`, where no reader looks.
+@contextmanager
+def half_written(root: Path, scene: Path) -> Iterator[Path]:
+    """A folder to write `scene` into, where no reader looks; the caller moves its contents when complete.
 
     Raises:
         DataError: the scene cannot be written (disk full, no permission).
     """
-    partial = Path(root) / ".partial" / f"{folder.parent.name}-{folder.name}-{os.getpid()}"
+    partial = Path(root) / ".partial" / f"{scene.parent.name}-{scene.name}-{os.getpid()}"
     try:
         shutil.rmtree(partial, ignore_errors=True)
-        for kind in ("rgb", "pose", "depth", "mask"):
-            (partial / kind).mkdir(parents=True)
-        for k, pose in enumerate(c2w):
-            Image.fromarray(views.rgb[k]).save(partial / "rgb" / f"{k:06d}.png")
-            (partial / "pose" / f"{k:06d}.txt").write_text(pose_text(pose))
-            np.savez_compressed(partial / "depth" / f"{k:06d}.npz", depth=views.depth[k].astype(np.float32))
-            mask = views.mask[k].astype(np.uint8) * 255
-            Image.fromarray(mask).save(partial / "mask" / f"{k:06d}.png")
-        (partial / "intrinsics.txt").write_text(intrinsics_text(views.rgb.shape[1]))
-        (partial / "scene.json").write_text(json.dumps(facts, indent=1, sort_keys=True) + "\n")
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        partial.rename(folder)
+        partial.mkdir(parents=True)
+        yield partial
     except OSError as error:
+        raise DataError(f"cannot write scene {scene}: {error}; free the disk or choose another root") from error
+    finally:
         shutil.rmtree(partial, ignore_errors=True)
-        raise DataError(f"cannot write scene {folder}: {error}; free the disk or choose another root") from error
 
 
 @contextmanager

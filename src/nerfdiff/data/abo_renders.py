@@ -1,0 +1,159 @@
+"""Amazon Berkeley Objects, 30-view renders (`abo-release-renders.zip`, the set of the paper).
+
+    <root>/…/<item_id>/{transforms.json, <item_id>_00.png … <item_id>_29.png}
+    <root>/…/<item_id>/depth/<item_id>_00.npz …           in generated copies: array `depth` along the camera's axis
+
+Images are RGBA with 8 or 16 bits. Poses are Blender's, around the object's centre at 1.8 / tan(20°) = 4.9455 times its
+largest half-extent: the reader moves that centre to the origin and scales the distance to 4.9455 for every object.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerfdiff.cameras import Cameras
+from nerfdiff.data import images
+from nerfdiff.data.abo_transforms import IMAGES, KEY_FILE, Transforms
+from nerfdiff.data.framing import Framing
+from nerfdiff.data.index import folder_stamp
+from nerfdiff.data.item_folders import item_folders
+from nerfdiff.data.npz_files import read_depth
+from nerfdiff.data.optical_axes import ObjectCameras, check_settings, object_cameras, report
+from nerfdiff.data.scene import MissingSplit, Scene
+from nerfdiff.data.split_file import stored_split
+from nerfdiff.data.view_stack import stack_pixels
+from nerfdiff.errors import ConfigError, DataError
+
+
+class ABORenders:
+    """One split of the 30-view renders, or of any dataset in their layout.
+
+    The release has no split. One is drawn from `split_seed` and stored, see `split_file.stored_split`: with the
+    paper's 6743 + 396 + 794 objects it has exactly these sizes, with another number of objects (the release has 7953,
+    a generated copy fewer) the same proportions of it. The paper's own assignment is unpublished.
+
+    Args:
+        root: a folder that has the folders of the objects in it, or up to five folders below.
+        split: "train", "val" or "test".
+        near, far: bounds of every scene as distances along rays, in units in which cameras are `distance` away.
+        distance: mean distance of an object's cameras from its centre, to which each scene is scaled.
+        convention: axes of the poses: "auto" (told from where cameras look), "opengl" (Blender's) or "opencv".
+        split_seed: of the split.
+        split_sizes: number of objects in each split of the whole release.
+        index_dir: where the list of objects is kept, so that only the first start looks for them.
+        image_size: (height, width), or one side of a square, to resize to; None keeps the stored size.
+        crop: (height, width), or one side of a square, to cut out of the middle before; None keeps all.
+
+    Raises:
+        ConfigError: a setting is none of the above.
+        MissingSplit: there are too few objects for this split.
+        DataError: `root` is missing or has no objects in it, or a stored split does not fit them.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        split: str,
+        near: float,
+        far: float,
+        distance: float,
+        convention: str,
+        split_seed: int,
+        split_sizes: Mapping[str, int],
+        index_dir: str | Path,
+        image_size: int | Sequence[int] | None = None,
+        crop: int | Sequence[int] | None = None,
+    ):
+        if split not in split_sizes:
+            raise ConfigError(f"split {split!r} is unknown; choose one of {', '.join(split_sizes)}")
+        check_settings(near, far, distance, convention)
+        self.near, self.far, self.distance = float(near), float(far), float(distance)
+        self.convention = convention
+        self.framing = Framing.of(crop, image_size)
+        self.root = Path(root)
+        folders = item_folders(self.root, index_dir, "abo_renders", KEY_FILE, IMAGES)
+        splits, self.split_sha256 = stored_split(self.root, index_dir, list(folders), split_sizes, split_seed)
+        self.scenes = tuple(splits.get(split, ()))
+        if not self.scenes:
+            sizes = ", ".join(f"{len(members)} {name}" for name, members in splits.items())
+            raise MissingSplit(f"{self.root}: no {split} split; {len(folders)} objects are split into {sizes}")
+        self.folders = tuple(folders[scene] for scene in self.scenes)
+        self.identity = (
+            f"abo_renders {self.root.resolve()} {split} {self.split_sha256} {self.framing} {convention} "
+            f"{self.distance} {self.near} {self.far}"
+        )
+        self._views: dict[int, tuple[str, ...]] = {}
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def fingerprint(self) -> str:
+        """Of the times of change of folders and `transforms.json`; images overwritten in place are not noticed."""
+        return folder_stamp(path for folder in self.folders for path in (folder, folder / KEY_FILE))
+
+    def scene_id(self, index: int) -> str:
+        return self.scenes[index]
+
+    def view_names(self, index: int) -> tuple[str, ...]:
+        if index not in self._views:
+            self._views[index] = Transforms.read(self.folders[index]).views
+        return self._views[index]
+
+    def geometry(self, index: int) -> ObjectCameras:
+        """All cameras of a scene as the file has them: what convention was found, and what they look at."""
+        return self._geometry(index, Transforms.read(self.folders[index]))
+
+    def load(self, index: int, views: Sequence[int] | None = None, truth: bool = False) -> Scene:
+        transforms = Transforms.read(self.folders[index])
+        geometry = self._geometry(index, transforms)
+        report(self.root, geometry)
+        positions = range(len(transforms.views)) if views is None else views
+        names = tuple(transforms.views[p] for p in positions)
+        files = [self.folders[index] / f"{name}.png" for name in names]
+        stored = [images.decode(file) for file in files]
+        K = [
+            self.framing.K(transforms.cameras[p].K(*image.shape[:2]), *image.shape[:2])
+            for p, image in zip(positions, stored, strict=True)
+        ]
+        pixels = stack_pixels([self.framing.image(image) for image in stored], files)
+        c2w = geometry.normalised(self.distance).c2w[list(positions)]
+        return Scene(
+            id=self.scenes[index],
+            views=names,
+            pixels=pixels,
+            cameras=Cameras(torch.from_numpy(c2w).float(), torch.from_numpy(np.stack(K)).float(), *pixels.shape[-2:]),
+            near=self.near,
+            far=self.far,
+            mask=self._masks(files) if truth else None,
+            depth=self._depth(files, [image.shape[:2] for image in stored], geometry) if truth else None,
+        )
+
+    def _geometry(self, index: int, transforms: Transforms) -> ObjectCameras:
+        file = self.folders[index] / KEY_FILE
+        return object_cameras(transforms.poses, self.convention, file, transforms.views)
+
+    def _masks(self, files: Sequence[Path]) -> Bool[Tensor, "views height width"] | None:
+        """Where the images are opaque; None where one of them has no alpha."""
+        masks = [images.decode_alpha(file) for file in files]
+        if any(mask is None for mask in masks):
+            return None
+        return torch.from_numpy(np.stack([self.framing.values(mask) for mask in masks]))
+
+    def _depth(
+        self, files: Sequence[Path], sizes: Sequence[tuple[int, int]], geometry: ObjectCameras
+    ) -> Float[Tensor, "views height width"] | None:
+        """`depth/<view>.npz` in units of the scene; None where the folder is not there."""
+        if not (files[0].parent / "depth").is_dir():
+            return None
+        scale, values = self.distance / geometry.distance, []
+        for image, size in zip(files, sizes, strict=True):
+            file = image.parent / "depth" / f"{image.stem}.npz"
+            depth = read_depth(file)
+            if depth.shape != size:
+                raise DataError(f"{file}: expected {size[0]}x{size[1]} values as in its image, found {depth.shape}")
+            values.append(self.framing.values(scale * depth))
+        return torch.from_numpy(np.stack(values))

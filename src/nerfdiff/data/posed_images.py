@@ -1,0 +1,217 @@
+"""A person's own posed images: one folder per scene, with nerfstudio's or Blender-synthetic's `transforms*.json`.
+
+    <root>/{train,val,test}/<scene>/transforms.json     splits as they are laid out
+    <root>/<scene>/transforms.json                      splits drawn from a seed
+    <root>/transforms.json                              one scene, which is every split
+
+What the files hold is said in `transforms_json`. Scenes may have any scale: density is per depth of the frustum, and
+near and far come from each scene's own cameras.
+"""
+
+import logging
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, UInt8
+
+from nerfdiff.cameras import Cameras
+from nerfdiff.data import images
+from nerfdiff.data.bounds import Gaze
+from nerfdiff.data.framing import Framing
+from nerfdiff.data.index import folder_stamp
+from nerfdiff.data.posed_files import MAX_POSITION
+from nerfdiff.data.posed_folders import find_scenes
+from nerfdiff.data.scene import Scene
+from nerfdiff.data.transforms_json import Frame, Transforms, find_image, read_transforms
+from nerfdiff.data.view_stack import stack_pixels
+from nerfdiff.errors import ConfigError, DataError
+
+CONVENTIONS = ("opengl", "opencv")
+KEPT_SCENES = 256
+"""Scenes whose JSON is remembered, so that the memory of a process does not grow with the dataset."""
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class _PosedScene:
+    """A scene's views, parsed and checked."""
+
+    transforms: Transforms
+    near: float
+    far: float
+
+
+class PosedImagesReader:
+    """One split of a person's own scenes.
+
+    Args:
+        root: the folder of the scenes, of their splits, or of a single scene.
+        split: "train", "val" or "test".
+        near, far: bounds of every scene as distances along rays, in units of the poses. Where None they are those
+            that a scene's file states as "near" and "far", or are estimated from its cameras (`bounds.Gaze`). (An
+            "aabb_scale" is no bound: real captures state one much larger than what they show.)
+        convention: axes of the poses, "opengl" as the formats have it, or "opencv".
+        inward: refuse scenes most of whose cameras look away from where their optical axes meet.
+        white_background: make white what a frame's mask leaves out; without, masks serve as ground truth only.
+            Transparency always lies on white.
+        split_sizes: proportions of the splits, where scenes lie side by side.
+        split_seed: which scenes those are; they depend on the names of all scenes, so a new scene may move others.
+        image_size: (height, width), or one side of a square, to resize to, each image with intrinsics of its own;
+            None keeps the stored size.
+        crop: (height, width), or one side of a square, to cut out of the middle before; None keeps all.
+
+    Raises:
+        ConfigError: settings that make no sense.
+        MissingSplit: `root` has no such split, or too few scenes for it.
+        DataError: `root` is missing or empty, or its first scene is damaged.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        split: str,
+        near: float | None,
+        far: float | None,
+        convention: str,
+        inward: bool,
+        white_background: bool,
+        split_sizes: Mapping[str, int],
+        split_seed: int,
+        image_size: int | Sequence[int] | None = None,
+        crop: int | Sequence[int] | None = None,
+    ):
+        if not all(bound is None or bound > 0 for bound in (near, far)) or (near and far and near >= far):
+            raise ConfigError(f"near = {near} and far = {far} must satisfy 0 < near < far, or be null")
+        if convention not in CONVENTIONS:
+            raise ConfigError(f"convention {convention!r} is unknown; choose one of {', '.join(CONVENTIONS)}")
+        self.near, self.far = near, far
+        self.convention, self.inward, self.white_background = convention, inward, white_background
+        self.framing = Framing.of(crop, image_size)
+        root = Path(root)
+        self.folders = find_scenes(root, split, split_sizes, split_seed)
+        self.identity = (
+            f"posed_images {root.resolve()} {split} {dict(split_sizes)} {split_seed} {self.framing} {convention} "
+            f"bounds {near} {far} white {white_background}"
+        )
+        self._parsed: dict[int, _PosedScene] = {}
+        first = self._scene(0)
+        if near is None or far is None:
+            log.info(
+                "%s split of %s: near and far of each scene are read from its file or estimated from its cameras; "
+                "those of %s are %.4g and %.4g. data.reader.near and data.reader.far set them for all",
+                split,
+                root,
+                self.scene_id(0),
+                first.near,
+                first.far,
+            )
+
+    def __len__(self) -> int:
+        return len(self.folders)
+
+    def fingerprint(self) -> str:
+        """Of the times of change of each scene's folder and what lies directly in it.
+
+        That is its JSON files and the folders of its images, so an image overwritten in place goes unnoticed.
+        """
+        return folder_stamp(path for folder in self.folders for path in (folder, *_visible(folder)))
+
+    def scene_id(self, index: int) -> str:
+        return Path(os.path.abspath(self.folders[index])).name  # the folder may be "."
+
+    def view_names(self, index: int) -> tuple[str, ...]:
+        return tuple(frame.name for frame in self._scene(index).transforms.frames)
+
+    def load(self, index: int, views: Sequence[int] | None = None, truth: bool = False) -> Scene:
+        scene = self._scene(index)
+        every = scene.transforms.frames
+        frames = every if views is None else [every[view] for view in views]
+        files = [find_image(frame.image) for frame in frames]
+        stored = [images.decode(file) for file in files]
+        sizes = [image.shape[:2] for image in stored]
+        K = [self.framing.K(f.pinhole.K(*size), *size) for f, size in zip(frames, sizes, strict=True)]
+        masks = [_mask(frame, size) for frame, size in zip(frames, sizes, strict=True)]
+        if self.white_background:
+            stored = [_on_white(image, mask) for image, mask in zip(stored, masks, strict=True)]
+        pixels = stack_pixels([self.framing.image(image) for image in stored], files)
+        c2w = np.stack([frame.c2w for frame in frames])
+        return Scene(
+            id=self.scene_id(index),
+            views=tuple(frame.name for frame in frames),
+            pixels=pixels,
+            cameras=Cameras(torch.from_numpy(c2w).float(), torch.from_numpy(np.stack(K)).float(), *pixels.shape[-2:]),
+            near=scene.near,
+            far=scene.far,
+            mask=self._truth(files, masks) if truth else None,
+        )
+
+    def _scene(self, index: int) -> _PosedScene:
+        parsed = self._parsed.get(index)
+        if parsed is None:
+            parsed = self._parse(self.folders[index])
+            if len(self._parsed) >= KEPT_SCENES:
+                self._parsed.clear()
+            self._parsed[index] = parsed
+        return parsed
+
+    def _parse(self, folder: Path) -> _PosedScene:
+        transforms = read_transforms(folder, self.convention)
+        gaze = Gaze.of(transforms.c2w)
+        if self.inward:
+            gaze.refuse_outward(folder, self.convention)
+        near = self.near if self.near is not None else transforms.near
+        far = self.far if self.far is not None else transforms.far
+        if near is None or far is None:
+            estimated = gaze.bounds(_half_angle(transforms.frames[0]), folder)
+            near, far = estimated[0] if near is None else near, estimated[1] if far is None else far
+        if not 0 < near < far < MAX_POSITION:
+            raise DataError(
+                f"{folder}: near = {near:g} and far = {far:g}, partly stated and partly estimated, are no bounds; "
+                "expected 0 < near < far; set both data.reader.near and data.reader.far"
+            )
+        return _PosedScene(transforms, float(near), float(far))
+
+    def _truth(self, files: Sequence[Path], masks: Sequence[np.ndarray | None]) -> torch.Tensor | None:
+        """Foreground by mask, or else by transparency; None where a view has neither."""
+        found = [images.decode_alpha(f) if mask is None else mask for f, mask in zip(files, masks, strict=True)]
+        if any(mask is None for mask in found):
+            return None
+        return torch.from_numpy(np.stack([self.framing.values(mask) for mask in found]))
+
+
+def _half_angle(frame: Frame) -> float:
+    """Half the field of view along the wider side of an image, as it is stored."""
+    height, width = images.stored_size(find_image(frame.image))
+    K = frame.pinhole.K(height, width)
+    return math.atan(max(width / K[0, 0], height / K[1, 1]) / 2)
+
+
+def _mask(frame: Frame, size: tuple[int, int]) -> Bool[np.ndarray, "height width"] | None:
+    if frame.mask is None:
+        return None
+    mask = images.decode_mask(frame.mask)
+    if mask.shape != size:
+        raise DataError(
+            f"{frame.mask}: {mask.shape[0]}x{mask.shape[1]} pixels, its image {frame.image.name} has "
+            f"{size[0]}x{size[1]}"
+        )
+    return mask
+
+
+def _on_white(
+    image: UInt8[np.ndarray, "height width 3"], mask: Bool[np.ndarray, "height width"] | None
+) -> UInt8[np.ndarray, "height width 3"]:
+    return image if mask is None else np.where(mask[..., None], image, np.uint8(255))
+
+
+def _visible(folder: Path) -> list[Path]:
+    try:
+        with os.scandir(folder) as entries:
+            return sorted(Path(entry.path) for entry in entries if not entry.name.startswith("."))
+    except OSError as error:
+        raise DataError(f"{folder}: the scene's folder cannot be listed ({error.strerror})") from error

@@ -1,0 +1,126 @@
+"""The report: tables on the terminal, the same in Markdown, and everything in JSON."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from nerfdiff.inspection.check import Status
+from nerfdiff.inspection.summary import SplitSummary
+from nerfdiff.results.files import write_text
+
+COLOURS = {Status.OK: "green", Status.FAILED: "bold red", Status.UNCHECKED: "yellow"}
+FACTS = ("split", "scenes", "views per scene", "read", "height x width", "focal length, px", "field of view, °",
+         "near", "far", "mask / depth")  # fmt: skip
+
+
+def facts(summary: SplitSummary) -> list[str]:
+    """One cell per heading of `FACTS`; what is not known is "–"."""
+    sizes = ", ".join(size if len(summary.sizes) == 1 else f"{size} ({n})" for size, n in summary.sizes.items())
+    truth = " / ".join(_some_of(count, summary.scenes_read) for count in (summary.masks, summary.depths))
+    values = (summary.views, None, None, summary.focal, summary.fov, summary.near, summary.far)
+    views, _, _, focal, fov, near, far = ("–" if value is None else str(value) for value in values)
+    read = f"{summary.scenes_read} scenes, {summary.images_read} images"
+    return [summary.stage, str(summary.scenes), views, read, sizes or "–", focal, fov, near, far, truth]
+
+
+def _some_of(count: int, total: int) -> str:
+    return "no" if count == 0 else "yes" if count == total else f"{count} of {total}"
+
+
+def print_report(console: Console, title: str, splits: Sequence[SplitSummary], limit: int) -> None:
+    """Tables of facts and of checks, then bad and suspect scenes (at most `limit` of each split)."""
+    there = [split for split in splits if not split.absent and not split.error]
+    table = Table(title=title)
+    for heading in FACTS:
+        table.add_column(heading)
+    for split in there:
+        table.add_row(*map(escape, facts(split)))
+    checks = Table()
+    for heading in ("split", "check", "result", "found"):
+        checks.add_column(heading)
+    for split in there:
+        for found in split.checks:
+            colour = COLOURS[found.status]
+            checks.add_row(split.stage, found.check, f"[{colour}]{found.status}[/]", escape(found.text))
+        checks.add_section()
+    if there:
+        console.print(table, checks)
+    for split in splits:
+        if split.absent or split.error:
+            colour = "yellow" if split.absent else "bold red"
+            state = "not there" if split.absent else "cannot be read"
+            console.print(f"[{colour}]{split.stage}: {state}[/]: {escape(split.absent or split.error)}", soft_wrap=True)
+        for scene, reason in list(split.bad.items())[:limit]:
+            console.print(f"[bold red]bad scene[/] {split.stage} {escape(f'{scene}: {reason}')}", soft_wrap=True)
+        if len(split.bad) > limit:
+            console.print(f"  and {len(split.bad) - limit} more bad scenes, all in the report")
+        for line in _suspects(split)[:limit]:
+            console.print(f"[yellow]suspect[/] {split.stage} {escape(line)}", soft_wrap=True)
+        for line in _notes(split):
+            console.print(f"[bold]{split.stage}[/]: {escape(line)}", soft_wrap=True)
+
+
+def write_report(folder: Path, title: str, splits: Sequence[SplitSummary]) -> list[Path]:
+    """Save `report.md` and `report.json`; returns their paths."""
+    failed = any(split.failures for split in splits)
+    content = {"dataset": title, "status": "failed" if failed else "ok", "splits": [s.as_dict() for s in splits]}
+    paths = [folder / "report.md", folder / "report.json"]
+    write_text(paths[0], markdown(title, splits))
+    write_text(paths[1], json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    return paths
+
+
+def markdown(title: str, splits: Sequence[SplitSummary]) -> str:
+    """The whole report, with the pictures by name."""
+    there = [split for split in splits if not split.absent and not split.error]
+    parts = [f"# {title}\n"]
+    if there:
+        parts.append(_table(FACTS, [facts(split) for split in there]))
+    for split in splits:
+        parts.append(f"## {split.stage}\n")
+        if split.absent or split.error:
+            parts.append(f"{'Not there' if split.absent else 'Cannot be read'}: {split.absent or split.error}\n")
+            continue
+        rows = [[found.check, f"**{found.status}**", found.text] for found in split.checks]
+        parts.append(_table(("check", "result", "found"), rows))
+        parts += [f"{line}\n" for line in _notes(split)]
+        bad = [f"- {scene}: {reason}" for scene, reason in split.bad.items()]
+        for heading, lines in (("Bad scenes", bad), ("Suspect scenes", [f"- {line}" for line in _suspects(split)])):
+            if lines:
+                parts.append(f"### {heading}\n\n" + "\n".join(lines) + "\n")
+        parts += [f"![{split.stage}, {what}]({name})\n" for what, name in split.pictures.items()]
+    return "\n".join(parts)
+
+
+def _notes(split: SplitSummary) -> list[str]:
+    if split.scenes_read and not split.compared:
+        return ["not checked whether cameras fit the images: there is no depth, silhouette or texture to tell by"]
+    if split.explanations is None or not any(found.status is Status.FAILED for found in split.checks):
+        return []  # a few suspects are no reason to doubt all cameras
+    if not split.explanations:
+        return ["no common misreading of cameras (axes, inverse, transposed, other resolution) explains the failure"]
+    return [f"every check of the cameras would pass if {name}" for name in split.explanations]
+
+
+def _suspects(split: SplitSummary) -> list[str]:
+    return [f"{scene} ({found.check}): {why}" for found in split.checks for scene, why in found.suspects.items()]
+
+
+def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [headings, ["---"] * len(headings), *rows]
+    return "".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |\n" for line in lines)
+
+
+def _plain(value):
+    """For JSON, which has no infinity."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not abs(value) < float("inf"):
+        return None
+    return value

@@ -1,0 +1,397 @@
+"""A person's own scenes: pixels, splits, masks, mixed sizes, bounds, and what is wrong with them."""
+
+import json
+import logging
+import math
+import os
+import pickle
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from hydra.utils import instantiate
+from PIL import Image
+
+from nerfdiff.cli import load_config
+from nerfdiff.data import posed_images
+from nerfdiff.data.cache import CachedReader
+from nerfdiff.data.posed_images import PosedImagesReader
+from nerfdiff.data.scene import MissingSplit, SceneReader
+from nerfdiff.errors import ConfigError, DataError
+from posed_fixtures import (
+    COLOURS,
+    CX,
+    CY,
+    FX,
+    FY,
+    HEIGHT,
+    POINTS,
+    SETTINGS,
+    WIDTH,
+    project,
+    write_blender,
+    write_nerfstudio,
+)
+
+
+def read(root, split="train", **changes) -> PosedImagesReader:
+    return PosedImagesReader(root, split, **{**SETTINGS, **changes})
+
+
+def edit(file, change) -> None:
+    content = json.loads(file.read_text())
+    change(content)
+    file.write_text(json.dumps(content))
+
+
+def assert_colours_found(scene, tolerance: int) -> None:
+    """The known colours lie where the scene's own cameras project the known points."""
+    pixels, _ = scene.cameras.project(torch.from_numpy(POINTS).float())
+    checked = 0
+    for view in range(len(scene.views)):
+        for k in range(len(POINTS)):
+            u, v = pixels[view, k]
+            inside = 1 < u < scene.cameras.width - 1 and 1 < v < scene.cameras.height - 1
+            others = (pixels[view] - pixels[view, k]).abs().amax(-1)
+            clear = torch.cat([others[:k], others[k + 1 :]]).min() > 6
+            if inside and clear:
+                difference = scene.pixels[view, :, int(v), int(u)].int() - torch.from_numpy(COLOURS[k]).int()
+                assert difference.abs().max() <= tolerance
+                checked += 1
+    assert checked >= 2 * len(scene.views)
+
+
+def test_nerfstudio_points_lie_on_their_pixels(tmp_path):
+    poses = write_nerfstudio(tmp_path)
+    reader = read(tmp_path)
+    assert isinstance(reader, SceneReader) and len(reader) == 1 and reader.scene_id(0) == tmp_path.name
+    scene = reader.load(0)
+    assert scene.views == reader.view_names(0) == tuple(f"frame_{k + 1:05d}" for k in range(6))
+    pixels, depth = scene.cameras.project(torch.from_numpy(POINTS).float())
+    expected = np.stack([project(pose) for pose in poses])
+    np.testing.assert_allclose(pixels, expected[..., :2], atol=1e-3)
+    np.testing.assert_allclose(depth, expected[..., 2], atol=1e-4)
+    assert scene.pixels.shape == (6, 3, HEIGHT, WIDTH) and scene.mask is None and scene.depth is None
+    assert_colours_found(scene, 0)
+
+
+def test_blender_points_lie_on_their_pixels(tmp_path):
+    poses = write_blender(tmp_path / "lego")
+    scene = read(tmp_path).load(0, truth=True)
+    assert scene.id == "lego" and scene.views == tuple(sorted(poses))
+    pixels, _ = scene.cameras.project(torch.from_numpy(POINTS).float())
+    expected = np.stack(
+        [project(poses[view], intrinsics=(FX, FX, WIDTH / 2, HEIGHT / 2))[:, :2] for view in scene.views]
+    )
+    np.testing.assert_allclose(pixels, expected, atol=1e-3)
+    assert_colours_found(scene, 0)
+    background = ~scene.mask[:, None].expand_as(scene.pixels)
+    assert (scene.pixels[background] == 255).all() and 0.01 < scene.mask.float().mean() < 0.5
+
+
+def test_rays_through_pixels_come_back_to_them(tmp_path):
+    poses = write_nerfstudio(tmp_path)
+    rays = read(tmp_path).load(0).cameras.rays(1, 5)
+    for row, column in ((0, 0), (7, 50), (39, 3)):
+        points = (rays.origins + 2.5 * rays.directions)[:, row, column].double().numpy()
+        for pose, point in zip(poses, points, strict=True):
+            np.testing.assert_allclose(project(pose, point[None])[0, :2], [column + 0.5, row + 0.5], atol=1e-3)
+
+
+def test_sizes_that_differ_come_to_one_with_their_own_intrinsics(tmp_path):
+    poses = write_nerfstudio(tmp_path, scales=(1, 2, 3))
+    with pytest.raises(DataError, match=r"frame_00002\.png: 80x112 pixels, other views .* 40x56; set data\.image_size"):
+        read(tmp_path).load(0)
+    scene = read(tmp_path, image_size=[80, 112]).load(0)
+    assert scene.pixels.shape == (6, 3, 80, 112)
+    assert torch.equal(
+        scene.cameras.K, torch.tensor([[2 * FX, 0, 2 * CX], [0, 2 * FY, 2 * CY], [0, 0, 1]]).expand(6, 3, 3)
+    )
+    pixels, _ = scene.cameras.project(torch.from_numpy(POINTS).float())
+    np.testing.assert_allclose(pixels, np.stack([2 * project(pose)[:, :2] for pose in poses]), atol=2e-3)
+    assert_colours_found(read(tmp_path, image_size=[40, 56]).load(0, [0]), 0)
+
+
+def test_crop_and_resize_keep_points_on_their_pixels(tmp_path):
+    poses = write_nerfstudio(tmp_path)
+    scene = read(tmp_path, crop=32, image_size=[64, 48]).load(0, truth=True)
+    assert scene.pixels.shape == (6, 3, 64, 48) and scene.mask.shape == (6, 64, 48)
+    pixels, _ = scene.cameras.project(torch.from_numpy(POINTS).float())
+    expected = np.stack([(project(pose)[:, :2] - [12, 4]) * [1.5, 2] for pose in poses])
+    np.testing.assert_allclose(pixels, expected, atol=2e-3)
+
+
+def test_images_at_another_resolution_than_stated(tmp_path):
+    write_nerfstudio(tmp_path)
+    edit(tmp_path / "transforms.json", lambda c: c.update(fl_x=2 * FX, fl_y=2 * FY, cx=2 * CX, cy=2 * CY, w=112, h=80))
+    assert_colours_found(read(tmp_path).load(0), 0)
+
+
+def test_masks_put_the_rest_on_white(tmp_path):
+    write_nerfstudio(tmp_path)
+    scene = read(tmp_path).load(0, truth=True)
+    plain = read(tmp_path, white_background=False).load(0, truth=True)
+    assert torch.equal(scene.mask, plain.mask)
+    outside = ~scene.mask[:, None].expand_as(scene.pixels)
+    assert (scene.pixels[outside] == 255).all() and (plain.pixels[outside] == 90).all()
+    assert torch.equal(scene.pixels[~outside], plain.pixels[~outside])
+
+
+def test_without_masks_there_are_none(tmp_path):
+    write_nerfstudio(tmp_path, masks=False)
+    scene = read(tmp_path).load(0, truth=True)
+    assert scene.mask is None and (scene.pixels == 90).any()
+
+
+def test_views_are_read_in_the_order_asked_for(tmp_path):
+    write_nerfstudio(tmp_path)
+    reader = read(tmp_path)
+    whole, part = reader.load(0, truth=True), reader.load(0, [4, 0, -2], truth=True)
+    assert part.views == ("frame_00005", "frame_00001", "frame_00005")
+    for key in ("pixels", "mask"):
+        assert torch.equal(getattr(part, key), getattr(whole, key)[[4, 0, 4]])
+    assert torch.equal(part.cameras.c2w, whole.cameras.c2w[[4, 0, 4]])
+
+
+def test_only_the_views_asked_for_are_decoded(tmp_path):
+    write_nerfstudio(tmp_path)
+    (tmp_path / "images/frame_00002.png").write_bytes(b"damaged")
+    assert read(tmp_path).load(0, [0, 2]).views == ("frame_00001", "frame_00003")
+
+
+def test_a_single_scene_is_every_split(tmp_path):
+    write_nerfstudio(tmp_path / "shoe")
+    for root in (tmp_path, tmp_path / "shoe"):
+        for split in ("train", "val", "test"):
+            assert [read(root, split).scene_id(0)] == ["shoe"] and len(read(root, split)) == 1
+
+
+def test_a_folder_given_as_a_dot_has_a_name(tmp_path, monkeypatch):
+    write_nerfstudio(tmp_path / "shoe")
+    monkeypatch.chdir(tmp_path / "shoe")
+    assert read(".").scene_id(0) == "shoe"
+
+
+def test_splits_may_be_folders(tmp_path):
+    for k, name in enumerate(("train/a", "train/b", "test/c")):
+        write_nerfstudio(tmp_path / name, views=2, seed=k)
+    assert [read(tmp_path).scene_id(i) for i in range(2)] == ["a", "b"] and len(read(tmp_path)) == 2
+    assert read(tmp_path, "test").scene_id(0) == "c"
+    with pytest.raises(MissingSplit, match=r"no val split; found only test, train"):
+        read(tmp_path, "val")
+
+
+def test_scenes_side_by_side_are_shared_out(tmp_path):
+    write_nerfstudio(tmp_path / "s0", views=2)
+    for k in range(1, 10):
+        shutil.copytree(tmp_path / "s0", tmp_path / f"s{k}")
+    (tmp_path / ".cache").mkdir()
+    (tmp_path / "notes.txt").touch()
+
+    def names(split, **changes):
+        reader = read(tmp_path, split, **changes)
+        return [reader.scene_id(i) for i in range(len(reader))]
+
+    parts = [names(split) for split in ("train", "val", "test")]
+    assert [len(part) for part in parts] == [8, 1, 1]
+    assert sorted(name for part in parts for name in part) == [f"s{k}" for k in range(10)]
+    assert names("train") == parts[0] != names("train", split_seed=1)
+    assert len(names("test", split_sizes={"train": 1, "test": 1})) == 5
+
+
+def test_too_few_scenes_for_a_split(tmp_path):
+    for k in range(2):
+        write_nerfstudio(tmp_path / f"s{k}", views=2)
+    with pytest.raises(MissingSplit, match=r"2 scenes are too few for a test split of 10 in 100.*folders train, val"):
+        read(tmp_path, "test")
+
+
+def test_bounds_are_estimated_and_said(tmp_path, caplog):
+    write_nerfstudio(tmp_path / "shoe", views=20)
+    with caplog.at_level(logging.INFO, "nerfdiff.data.posed_images"):
+        scene = read(tmp_path).load(0, [0])
+    radius = 3 * math.sin(math.atan(WIDTH / 2 / FX))
+    assert scene.near == pytest.approx(2.8 - radius, abs=0.15) and scene.far == pytest.approx(3.2 + radius, abs=0.15)
+    (said,) = caplog.messages
+    assert f"those of shoe are {scene.near:.4g} and {scene.far:.4g}" in said and "data.reader.near" in said
+
+
+def test_bounds_come_from_the_file_or_from_the_config(tmp_path, caplog):
+    write_nerfstudio(tmp_path / "stated", near=1.0, far=5.0)
+    assert [getattr(read(tmp_path).load(0, [0]), key) for key in ("near", "far")] == [1.0, 5.0]
+    assert [getattr(read(tmp_path, far=7.0).load(0, [0]), key) for key in ("near", "far")] == [1.0, 7.0]
+    caplog.clear()
+    with caplog.at_level(logging.INFO, "nerfdiff.data.posed_images"):
+        assert [getattr(read(tmp_path, near=2, far=9).load(0, [0]), key) for key in ("near", "far")] == [2.0, 9.0]
+    assert not caplog.messages
+    with pytest.raises(DataError, match=r"stated: near = 6 and far = 5, partly.*set both data\.reader\.near"):
+        read(tmp_path, near=6.0)
+
+
+def test_forward_facing_captures_need_bounds(tmp_path):
+    write_nerfstudio(tmp_path, views=4)
+
+    def line_up(content):
+        for k, frame in enumerate(content["frames"]):
+            frame["transform_matrix"] = np.eye(4).tolist()
+            frame["transform_matrix"][0][3] = 0.1 * k
+
+    edit(tmp_path / "transforms.json", line_up)
+    with pytest.raises(DataError, match=r"near and far cannot be estimated.*set data\.reader\.near"):
+        read(tmp_path)
+    assert read(tmp_path, near=1.0, far=4.0).load(0).far == 4.0
+
+
+def test_another_convention_is_refused_and_can_be_said(tmp_path):
+    poses = write_nerfstudio(tmp_path / "a")
+
+    def convert(content):
+        for frame, pose in zip(content["frames"], poses, strict=True):
+            frame["transform_matrix"] = (pose @ np.diag([1, -1, -1, 1])).tolist()
+
+    edit(tmp_path / "a/transforms.json", convert)
+    with pytest.raises(DataError, match=r"a: 6 of 6 cameras look away.*data\.reader\.convention=opencv"):
+        read(tmp_path)
+    assert_colours_found(read(tmp_path, convention="opencv").load(0), 0)
+    assert read(tmp_path, inward=False, near=1.0, far=2.0).load(0).near == 1.0
+
+
+def test_outward_captures_can_be_read(tmp_path):
+    write_nerfstudio(tmp_path)
+
+    def turn(content):
+        for frame in content["frames"]:
+            matrix = np.array(frame["transform_matrix"]) @ np.diag([-1, 1, -1, 1])
+            frame["transform_matrix"] = matrix.tolist()
+
+    edit(tmp_path / "transforms.json", turn)
+    with pytest.raises(DataError, match="inward=false"):
+        read(tmp_path, near=1.0, far=2.0)
+    assert len(read(tmp_path, near=1.0, far=2.0, inward=False).load(0).views) == 6
+
+
+def test_suffixes_and_jpegs(tmp_path):
+    write_nerfstudio(tmp_path, suffix=".jpg", masks=False)
+    edit(
+        tmp_path / "transforms.json",
+        lambda c: [f.update(file_path=f["file_path"].removesuffix(".jpg")) for f in c["frames"]],
+    )
+    scene = read(tmp_path).load(0)
+    assert scene.views[0] == "frame_00001" and scene.pixels.shape == (6, 3, HEIGHT, WIDTH)
+
+
+def test_memory_does_not_grow_with_the_dataset(tmp_path, monkeypatch):
+    monkeypatch.setattr(posed_images, "KEPT_SCENES", 2)
+    for k in range(5):
+        write_nerfstudio(tmp_path / f"train/s{k}", views=2, seed=k)
+    reader = read(tmp_path)
+    centres = [reader.load(k).cameras.centres for k in (0, 1, 2, 3, 4, 0)]
+    assert len(reader._parsed) <= 2 and torch.equal(centres[0], centres[5])
+    assert torch.equal(pickle.loads(pickle.dumps(reader)).load(4).cameras.centres, centres[4])
+
+
+def test_fingerprint_and_identity(tmp_path):
+    write_blender(tmp_path / "data/lego")
+    root = tmp_path / "data"
+    first = read(root).fingerprint()
+    assert read(root).fingerprint() == first
+    shutil.copy(root / "lego/train/r_0.png", root / "lego/train/r_1.png.new")
+    os.replace(root / "lego/train/r_1.png.new", root / "lego/train/r_1.png")
+    second = read(root).fingerprint()
+    edit(root / "lego/transforms_val.json", lambda c: c["frames"].pop())
+    assert len({first, second, read(root).fingerprint()}) == 3
+    readers = [
+        read(root),
+        read(root / "lego"),
+        read(root, "test"),
+        read(root, near=1.0),
+        read(root, white_background=False),
+        read(root, image_size=32),
+        read(root, convention="opencv", inward=False, near=1.0, far=2.0),
+    ]
+    assert len({reader.identity for reader in readers}) == len(readers)
+
+
+def test_the_image_cache_keeps_each_scenes_bounds(tmp_path):
+    for k in range(2):
+        write_nerfstudio(tmp_path / f"data/train/s{k}", views=3, seed=k)
+    reader = read(tmp_path / "data")
+    cached = CachedReader(reader, tmp_path / "cache", "posed")
+    for k in range(2):
+        here, there = cached.load(k), reader.load(k)
+        assert torch.equal(here.pixels, there.pixels) and torch.equal(here.cameras.K, there.cameras.K)
+        assert (here.near, here.far) == (there.near, there.far)
+    assert reader.load(0).near != reader.load(1).near
+
+
+def test_the_configuration_reads_a_scene(tmp_path):
+    write_nerfstudio(tmp_path, scales=(1, 2))
+    cfg = load_config("train", ["data=posed_images", f"data.root={tmp_path}", "data.reader.far=9.5"])
+    reader = instantiate(cfg.data.reader)(root=cfg.data.root, split="val", image_size=cfg.data.image_size)
+    scene = reader.load(0)
+    assert scene.pixels.shape == (6, 3, 128, 128) and scene.far == 9.5
+    assert len(pickle.dumps(reader)) < 20000
+
+
+CASES = {
+    "truncated image": ("images/frame_00002.png", lambda f: f.write_bytes(f.read_bytes()[:-60]), "not a whole image"),
+    "missing image": ("images/frame_00002.png", lambda f: f.unlink(), "no such image"),
+    "missing mask": ("masks/frame_00002.png", lambda f: f.unlink(), "no such image"),
+    "other size": (
+        "images/frame_00002.png",
+        lambda f: Image.fromarray(np.zeros((20, 28, 3), np.uint8)).save(f),
+        "20x28",
+    ),
+    "small mask": (
+        "masks/frame_00002.png",
+        lambda f: Image.fromarray(np.zeros((9, 9), np.uint8)).save(f),
+        r"frame_00002\.png: 9x9 pixels, its image frame_00002\.png has 40x56",
+    ),
+    "portrait": (
+        "images/frame_00002.png",
+        lambda f: Image.fromarray(np.zeros((WIDTH, HEIGHT, 3), np.uint8)).save(f),
+        r"frames\[1\] \(images/frame_00002\.png\): intrinsics are for w x h = 56x40, but the image is 40x56",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_damaged_files(tmp_path, name):
+    write_nerfstudio(tmp_path / "a")
+    file, change, message = CASES[name]
+    change(tmp_path / "a" / file)
+    with pytest.raises(DataError, match=message) as error:
+        read(tmp_path).load(0)
+    assert str(tmp_path / "a") in str(error.value) and "\n" not in str(error.value)
+    assert "frame_00002" in str(error.value)
+
+
+def test_wrong_roots(tmp_path):
+    with pytest.raises(DataError, match=r"nowhere: no such folder; set data\.root.*transforms\.json"):
+        read(tmp_path / "nowhere")
+    with pytest.raises(DataError, match=r"no scenes; expected one folder per scene.*transforms\.json"):
+        read(tmp_path)
+    (tmp_path / "a").mkdir()
+    with pytest.raises(DataError, match=r"a: no transforms\.json"):
+        read(tmp_path)
+    (tmp_path / "train").mkdir()
+    with pytest.raises(DataError, match="train: the split is empty"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"split": "dev"}, "'dev' is unknown; choose one of train, val, test"),
+        ({"near": 2.0, "far": 1.0}, "0 < near < far"),
+        ({"near": 0.0}, "0 < near < far"),
+        ({"far": float("nan")}, "0 < near < far"),
+        ({"convention": "colmap"}, "'colmap' is unknown; choose one of opengl, opencv"),
+        ({"image_size": 0}, "image_size"),
+    ],
+)
+def test_settings_that_make_no_sense(tmp_path, changes, message):
+    write_nerfstudio(tmp_path)
+    with pytest.raises(ConfigError, match=message):
+        read(tmp_path, **{"split": "train", **changes})

@@ -198,3 +198,11 @@ def test_a_wrong_key_ends_the_command_with_one_line():
     done = run(str(SRC / "train.py"), "modle=large")
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1 and done.stderr.startswith("error: modle is not a key")
+
+
+@pytest.mark.parametrize("data", ["srn_cars", "abo", "clevr3d"])
+@pytest.mark.parametrize("size", ["32", "[30,40]", "null"])
+def test_image_sizes_may_be_one_side_or_two(data, size):
+    check_overrides("train", [f"data={data}", f"data.image_size={size}"])
+    with pytest.raises(ConfigError, match=r"data\.image_size takes"):
+        check_overrides("train", ["data=abo", "data.image_size=wide"])

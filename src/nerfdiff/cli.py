@@ -21,6 +21,7 @@ from nerfdiff.errors import ConfigError, UserError
 CONF = Path(__file__).parents[2] / "conf"
 
 # What a value must be, by the type of its default.
+SIZES = ("image_size", "crop")  # one side of a square, or [height, width]
 KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
     bool: ("bool", (bool,)),
     int: ("int", (int,)),
@@ -205,6 +206,8 @@ def _check_kind(default: object, override: Override) -> None:
     value = override.value()
     interpolated = isinstance(value, str) and "${" in value
     if type(default) not in KINDS or value is None or interpolated or override.is_sweep_override():
+        return
+    if override.key_or_group.rpartition(".")[2] in SIZES and isinstance(value, (int, list)):
         return
     name, allowed = KINDS[type(default)]
     if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):

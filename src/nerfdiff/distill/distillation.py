@@ -1,0 +1,92 @@
+"""A field fine-tuned for one scene at test time, by any teacher, then rendered: strategies `ngd`, `direct`, `sds`."""
+
+import logging
+from dataclasses import dataclass
+
+import torch
+from lightning import Trainer
+
+from nerfdiff.data.batch import ViewBatch
+from nerfdiff.distill.prior import Prior
+from nerfdiff.distill.refined_field import RefinedField
+from nerfdiff.distill.strategy import Views
+from nerfdiff.distill.teacher import MakeTeacher
+from nerfdiff.distill.virtual_views import VirtualViews
+from nerfdiff.metrics.depth import z_depth
+from nerfdiff.model import NerfDiff
+from nerfdiff.modules.ngd_module import NGDModule
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Distillation:
+    """Encode once, fit the field to what the teacher makes of the virtual views, render.
+
+    Args:
+        prior: Π, the virtual views' cameras.
+        teacher: of the images they should show.
+        inner_steps: N.
+        rays: B.
+        lr_planes, lr_decoder: learning rates of W and θ.
+        views_at_once: views denoised in one batch, which bounds memory.
+    """
+
+    name: str
+    prior: Prior
+    teacher: MakeTeacher
+    inner_steps: int
+    rays: int
+    lr_planes: float
+    lr_decoder: float
+    views_at_once: int
+
+    def predict(self, model: NerfDiff, scene: ViewBatch, seed: int) -> Views:
+        module = self.distil(model, scene, seed)
+        with torch.no_grad():
+            rendering = module.field.render(model.renderer, scene.target_cameras)
+        samples = model.renderer.samples_per_ray
+        fitted = len(module.trace) * self.inner_steps * self.rays
+        watched = len(module.trace) * len(module.views) * rendering.opacity[0, 0].numel()
+        return Views(
+            images=rendering.rgb[0].movedim(-1, 1),
+            opacity=rendering.opacity[0],
+            depth=z_depth(rendering.depth[0], scene.target_cameras[0]),
+            denoiser_calls=module.views.denoiser_calls,
+            field_queries=samples * (fitted + watched + rendering.opacity.numel()),
+        )
+
+    def distil(self, model: NerfDiff, scene: ViewBatch, seed: int) -> NGDModule:
+        """The fine-tuned field of a batch of one scene, with its trace and status."""
+        purpose = (seed, "distil", *scene.scene_ids)
+        with torch.no_grad():
+            encoding = model.encode(scene.source, scene.source_cameras, scene.near, scene.far)
+        views = VirtualViews(model, encoding, self.prior(scene), self.views_at_once, purpose)
+        module = NGDModule(
+            RefinedField(encoding.triplane, model.decoder),
+            views,
+            self.teacher(views),
+            self.inner_steps,
+            self.rays,
+            self.lr_planes,
+            self.lr_decoder,
+            purpose,
+        )
+        device = scene.source.device
+        # one Trainer per scene: what it says once per training run would fill the log
+        logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+        trainer = Trainer(
+            max_epochs=1,
+            accelerator="cuda" if device.type == "cuda" else "cpu",
+            devices=[device.index or 0] if device.type == "cuda" else 1,
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+        )
+        with torch.enable_grad():
+            trainer.fit(module)
+        module.to(device)
+        if module.status != "ok":
+            log.warning("%s of scene %s fell back: %s", self.name, scene.scene_ids[0], module.status)
+        return module

@@ -1,0 +1,29 @@
+"""Score distillation: renderings noised at random t and denoised are what the field is fitted to (paper, appendix)."""
+
+from nerfdiff.diffusion.schedule import add_noise, alpha_sigma, expand
+from nerfdiff.distill.virtual_views import Images, VirtualViews
+
+
+class DenoisedRenderings:
+    """Each time, every view's rendering is noised to a time of its own and denoised in one step.
+
+    Args:
+        views: whose renderings are denoised.
+        steps: how many times targets are asked for; each costs as many denoiser calls as a step of NGD.
+        t_max, t_min: times are uniform between them.
+        condition: the rendering that the CDM sees: the `first` or the `current` one.
+    """
+
+    weight = None
+
+    def __init__(self, views: VirtualViews, steps: int, t_max: float, t_min: float, condition: str):
+        self.views, self.steps = views, steps
+        self.t_max, self.t_min = t_max, t_min
+        self.on_current = condition == "current"
+
+    def targets(self, step: int, rendered: Images) -> Images:
+        t = self.t_min + (self.t_max - self.t_min) * self.views.uniform()
+        alpha, sigma = (expand(c, rendered) for c in alpha_sigma(t))
+        z = add_noise(2 * rendered - 1, self.views.noise(), alpha, sigma)
+        x0 = self.views.denoise(z, t, rendered if self.on_current else None)
+        return (0.5 * (x0 + 1)).clamp(0, 1)

@@ -1,0 +1,28 @@
+"""Where methods differ: what images the field is fitted to at each step."""
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+from nerfdiff.distill.virtual_views import Images, VirtualViews
+
+
+@runtime_checkable
+class Teacher(Protocol):
+    """A run of target images for all virtual views."""
+
+    steps: int
+    """How many times targets are asked for."""
+
+    weight: float | None
+    """Of guidance at the last step, where there is one."""
+
+    def targets(self, step: int, rendered: Images) -> Images:
+        """Images in [0, 1] to fit the field to.
+
+        Args:
+            step: from 0 to `steps` - 1, each once, in order.
+            rendered: the field's images of all views now, in [0, 1].
+        """
+
+
+MakeTeacher = Callable[[VirtualViews], Teacher]

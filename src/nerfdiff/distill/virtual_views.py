@@ -1,0 +1,73 @@
+"""K virtual views of one scene, and the frozen CDM that denoises them."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfdiff.cameras import Cameras
+from nerfdiff.diffusion.denoiser import Condition
+from nerfdiff.field.encoder import Encoding
+from nerfdiff.model import NerfDiff
+from nerfdiff.randomness import generator
+
+Images = Float[Tensor, "views 3 height width"]
+
+
+class VirtualViews:
+    """What the CDM needs to denoise views in parts, with renderings that may change.
+
+    Args:
+        model: frozen.
+        encoding: of the input image, computed once.
+        cameras: [1, K], in the input camera's space.
+        views_at_once: views denoised in one batch, which bounds memory.
+        seed: of all noise; a view's noise depends on it and on the view's number alone.
+    """
+
+    @torch.no_grad()
+    def __init__(
+        self, model: NerfDiff, encoding: Encoding, cameras: Cameras, views_at_once: int, seed: tuple[int | str, ...]
+    ):
+        self.model, self.encoding, self.cameras = model, encoding, cameras
+        self._parts = torch.arange(cameras.shape[1]).split(views_at_once)
+        self._conditions: list[Condition] = []
+        for part in self._parts:
+            chunk = cameras[:, part]
+            self._conditions.append(model.condition(encoding, chunk, model.render(encoding, chunk)))
+        self._noise = [generator(encoding.source.device, *seed, view) for view in range(len(self))]
+        self.denoiser_calls = 0
+
+    def __len__(self) -> int:
+        return self.cameras.shape[1]
+
+    @property
+    def first_renderings(self) -> Images:
+        """The single-image NeRF's images of all views, in [0, 1]."""
+        return torch.cat([condition.rendered for condition in self._conditions])
+
+    @torch.no_grad()
+    def denoise(self, z: Images, t: Float[Tensor, "views"], rendered: Images | None = None) -> Images:
+        """x0 in [-1, 1] of every view.
+
+        Args:
+            t: of each view.
+            rendered: what the CDM is conditioned on, in [0, 1]; None: the first renderings.
+        """
+        self.denoiser_calls += len(z)
+        x0 = []
+        for part, condition in zip(self._parts, self._conditions, strict=True):
+            if rendered is not None:
+                condition = replace(condition, rendered=rendered[part])
+            x0.append(self.model.denoiser(z[part], t[part], condition))
+        return torch.cat(x0)
+
+    def noise(self) -> Images:
+        """Fresh standard normal images, each from its own view's stream."""
+        shape = self._conditions[0].rendered.shape[1:]
+        return torch.stack([torch.randn(shape, generator=g, device=g.device) for g in self._noise])
+
+    def uniform(self) -> Float[Tensor, "views"]:
+        """A fresh number in [0, 1) for every view, from its own stream."""
+        return torch.stack([torch.rand((), generator=g, device=g.device) for g in self._noise])

@@ -1,0 +1,121 @@
+"""Test-time fine-tuning on a tiny model: its limits, its failures, and what it leaves alone."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from model_fixtures import input_cameras, look_at, model
+from nerfdiff.cameras import Cameras
+from nerfdiff.data.batch import ViewBatch
+from nerfdiff.distill.direct import SampledViews
+from nerfdiff.distill.distillation import Distillation
+from nerfdiff.distill.guidance import Guidance
+from nerfdiff.distill.ngd import GuidedViews
+from nerfdiff.distill.sds import DenoisedRenderings
+
+
+def scene() -> ViewBatch:
+    noise = torch.Generator().manual_seed(3)
+    source = input_cameras(1)
+    pixels = torch.randint(0, 256, (1, 3, 16, 16), generator=noise, dtype=torch.uint8)
+    targets = Cameras(look_at((0.5, 0.2, 0.4))[None, None], source.K[:, None], 16, 16)
+    return ViewBatch(
+        draws=torch.tensor([0]),
+        source_pixels=pixels,
+        source_cameras=source,
+        target_pixels=pixels[:, None],
+        target_cameras=targets,
+        near=torch.tensor([0.8]),
+        far=torch.tensor([1.8]),
+        scene_ids=("a",),
+        source_views=("0",),
+        target_views=(("1",),),
+    )
+
+
+def prior(views: int):
+    places = [(0.9, -0.4, 0.7), (-0.8, 0.3, 1.0), (0.2, 0.6, 2.4)][:views]
+
+    def cameras(scene: ViewBatch) -> Cameras:
+        c2w = torch.stack([look_at(place) for place in places])[None]
+        return Cameras(c2w, scene.source_cameras.K[:, None].expand(1, views, 3, 3), 16, 16)
+
+    return cameras
+
+
+def guided(gamma=0.3, schedule="snr", condition="first"):
+    return lambda views: GuidedViews(views, 4, 1.0, 0.0, 0.0, Guidance(schedule, gamma, "current"), condition)
+
+
+TEACHERS = {
+    "ngd": guided(),
+    "ngd, current": guided(condition="current"),
+    "direct": lambda views: SampledViews(views, 4, 3, 1.0, 0.0, 0.0),
+    "sds": lambda views: DenoisedRenderings(views, 4, 1.0, 0.02, "first"),
+}
+
+
+def distillation(teacher, views=3, inner_steps=3, rays=64, lr_planes=1e-2) -> Distillation:
+    return Distillation("test", prior(views), teacher, inner_steps, rays, lr_planes, 1e-4, views_at_once=2)
+
+
+@pytest.mark.parametrize("teacher", TEACHERS)
+def test_every_teacher_fits_the_field_and_leaves_the_model_alone(teacher):
+    net = model(conditioning={"residual_std": 0.2}).requires_grad_(False)
+    before = {name: value.clone() for name, value in net.state_dict().items()}
+    module = distillation(TEACHERS[teacher]).distil(net, scene(), seed=0)
+    assert module.status == "ok" and len(module.trace) == 4
+    assert all(torch.equal(before[name], value) for name, value in net.state_dict().items())
+    assert not any(parameter.requires_grad for parameter in net.parameters())
+    with torch.no_grad():
+        start = net.encode(scene().source, scene().source_cameras, scene().near, scene().far).triplane.planes
+    assert not torch.allclose(module.field.planes, start)
+    again = distillation(TEACHERS[teacher]).distil(net, scene(), seed=0)
+    assert torch.equal(again.field.planes, module.field.planes)
+    assert not torch.equal(distillation(TEACHERS[teacher]).distil(net, scene(), 1).field.planes, module.field.planes)
+
+
+def test_full_guidance_asks_for_what_is_rendered_already():
+    net = model().requires_grad_(False)
+    module = distillation(guided(1.0, "constant")).distil(net, scene(), seed=0)
+    assert all(step.agreement == pytest.approx(60, abs=0.1) for step in module.trace)
+
+
+def test_without_guidance_and_inner_steps_views_are_plain_samples():
+    net = model(conditioning={"residual_std": 0.2}).requires_grad_(False)
+    module = distillation(guided(0.0), inner_steps=0).distil(net, scene(), seed=0)
+    views = dataclasses.replace(
+        distillation(guided(0.0), inner_steps=0), teacher=lambda v: SampledViews(v, 1, 4, 1, 0, 0)
+    )
+    sampled = views.distil(net, scene(), seed=0)
+    torch.testing.assert_close(module._last_targets, sampled._last_targets)
+
+
+@pytest.mark.parametrize("gamma", [0.0, 1.0, 1e6])
+def test_one_view_and_one_ray_give_numbers(gamma):
+    net = model().requires_grad_(False)
+    module = distillation(guided(gamma), views=1, rays=1).distil(net, scene(), seed=0)
+    assert module.field.is_finite() and module.status in ("ok", "diverged")
+
+
+def test_a_field_that_blows_up_falls_back_to_the_last_good_one():
+    net = model().requires_grad_(False)
+
+    class Poisoned(GuidedViews):
+        def targets(self, step, rendered):
+            images = super().targets(step, rendered)
+            return images * float("nan") if step == 2 else images
+
+    poisoned = distillation(lambda v: Poisoned(v, 4, 1.0, 0.0, 0.0, Guidance("snr", 0.3, "current"), "first"))
+    module = poisoned.distil(net, scene(), seed=0)
+    assert module.status == "non-finite" and len(module.trace) == 3
+    assert module.field.is_finite()
+
+
+def test_a_field_made_worse_falls_back_to_where_it_began():
+    net = model().requires_grad_(False)
+    module = distillation(TEACHERS["direct"], lr_planes=1e4).distil(net, scene(), seed=0)
+    with torch.no_grad():
+        start = net.encode(scene().source, scene().source_cameras, scene().near, scene().far).triplane.planes
+    assert module.status == "diverged" and torch.equal(module.field.planes, start)

@@ -80,6 +80,12 @@ class Cameras:
         K = torch.stack([c.K for c in cameras], dim)
         return Cameras(c2w, K, *sizes.pop())
 
+    @staticmethod
+    def join(cameras: Sequence["Cameras"]) -> "Cameras":
+        """Put cameras of one image size one after the other along their first axis."""
+        c2w, K = (torch.cat([getattr(c, name) for c in cameras]) for name in ("c2w", "K"))
+        return replace(cameras[0], c2w=c2w, K=K)
+
     @property
     def centres(self) -> Float[Tensor, "*batch 3"]:
         """Camera centres."""

@@ -65,10 +65,10 @@ class NerfDiff(nn.Module):
         views = cameras.shape[1]
         return Condition(
             rendered=rendering.rgb.flatten(0, 1).movedim(-1, 1),
-            source=encoding.source.repeat_interleave(views, 0),
+            source=_for_each_view(encoding.source, views),
             cameras=cameras.flatten(),
             near=encoding.triplane.near.repeat_interleave(views),
-            features=[feature.repeat_interleave(views, 0) for feature in encoding.features],
+            features=[_for_each_view(feature, views) for feature in encoding.features],
         )
 
     def denoise(
@@ -90,3 +90,8 @@ def build_on_meta(config: Mapping) -> NerfDiff:
     """The model on the meta device: shapes and counts without memory."""
     with torch.device("meta"):
         return NerfDiff(**config)
+
+
+def _for_each_view(values: Tensor, views: int) -> Tensor:
+    """Each entry of the batch, repeated for its views; of a single scene without copying."""
+    return values.expand(views, *values.shape[1:]) if len(values) == 1 else values.repeat_interleave(views, 0)

@@ -49,9 +49,7 @@ def orbit(source: Cameras, others: Cameras, frames: int) -> Cameras:
     Args:
         source: [1]; others: [n], in the same space.
     """
-    everyone = Cameras(
-        torch.cat([source.c2w, others.c2w]), torch.cat([source.K, others.K]), source.height, source.width
-    )
+    everyone = Cameras.join([source, others])
     point, up = look_at_point(everyone), up_direction(everyone)
     arm = source.centres[0] - point
     height = (arm @ up) * up

@@ -13,6 +13,7 @@ from nerfdiff.distill.distillation import Distillation
 from nerfdiff.distill.guidance import Guidance
 from nerfdiff.distill.ngd import GuidedViews
 from nerfdiff.distill.sds import DenoisedRenderings
+from nerfdiff.distill.stochastic import AutoregressiveViews
 
 
 def scene() -> ViewBatch:
@@ -53,6 +54,7 @@ TEACHERS = {
     "ngd, current": guided(condition="current"),
     "direct": lambda views: SampledViews(views, 4, 3, 1.0, 0.0, 0.0),
     "sds": lambda views: DenoisedRenderings(views, 4, 1.0, 0.02, "first"),
+    "stochastic": lambda views: AutoregressiveViews(views, 4, 3, 1.0, 0.0, 0.0),
 }
 
 

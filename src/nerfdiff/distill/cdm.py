@@ -1,7 +1,6 @@
 """Strategy `cdm`: every view sampled from the CDM by itself ("Ours (CDM)" in the paper's figures)."""
 
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -11,19 +10,30 @@ from nerfdiff.cameras import Cameras
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.diffusion.ddim import ddim_sample, time_steps
 from nerfdiff.distill.strategy import Views
+from nerfdiff.distill.virtual_views import Images, VirtualViews
 from nerfdiff.field.encoder import Encoding
 from nerfdiff.model import NerfDiff
-from nerfdiff.randomness import generator
 
 
-@dataclass(frozen=True)
-class IndependentViews:
-    """DDIM for each view, conditioned on the single-image NeRF's rendering of it. Not 3D consistent.
+def sample_views(views: VirtualViews, steps: int, t_max: float, t_min: float, eta: float) -> Images:
+    """DDIM for each view, conditioned on the single-image NeRF's rendering of it: images in [0, 1]. Not 3D consistent.
 
     Args:
         steps: DDIM steps (paper: 64).
         t_max, t_min: times where sampling starts and ends.
         eta: DDIM's η; 0 is deterministic given the initial noise.
+    """
+    times = time_steps(steps, t_max, t_min, device=views.encoding.source.device)
+    x0 = ddim_sample(lambda z, t: views.denoise(z, t.expand(len(z))), views.noise(), times, eta, views.noise)
+    return (0.5 * (x0 + 1)).clamp(0, 1)
+
+
+@dataclass(frozen=True)
+class IndependentViews:
+    """The views to predict, as `sample_views` makes them.
+
+    Args:
+        steps, t_max, t_min, eta: as there.
         views_at_once: views denoised in one batch, which bounds memory.
     """
 
@@ -53,18 +63,5 @@ class IndependentViews:
         Args:
             seed: a view's noise depends on it and on the view's position, not on what is sampled beside it.
         """
-        device = encoding.source.device
-        times = time_steps(self.steps, self.t_max, self.t_min, device=device)
-        images = []
-        for start in range(0, cameras.shape[1], self.views_at_once):
-            chunk = cameras[:, start : start + self.views_at_once]
-            condition = model.condition(encoding, chunk, model.render(encoding, chunk))
-            sources = [generator(device, *seed, start + view) for view in range(chunk.shape[1])]
-            noise = partial(_noise, sources, condition.rendered.shape[1:])
-            x0 = ddim_sample(lambda z, t, c=condition: model.denoise(z, t, c), noise(), times, self.eta, noise)
-            images.append((0.5 * (x0 + 1)).clamp(0, 1))
-        return torch.cat(images)[None]
-
-
-def _noise(sources: list[torch.Generator], shape: torch.Size) -> Float[Tensor, "views 3 height width"]:
-    return torch.stack([torch.randn(shape, generator=source, device=source.device) for source in sources])
+        views = VirtualViews(model, encoding, cameras, self.views_at_once, seed)
+        return sample_views(views, self.steps, self.t_max, self.t_min, self.eta)[None]

@@ -1,6 +1,6 @@
 """Direct distillation: every view sampled once by itself, and the field fitted to what came out (paper, appendix)."""
 
-from nerfdiff.diffusion.ddim import ddim_sample, time_steps
+from nerfdiff.distill.cdm import sample_views
 from nerfdiff.distill.virtual_views import Images, VirtualViews
 
 
@@ -18,9 +18,7 @@ class SampledViews:
 
     def __init__(self, views: VirtualViews, steps: int, sampler_steps: int, t_max: float, t_min: float, eta: float):
         self.steps = steps
-        times = time_steps(sampler_steps, t_max, t_min, device=views.encoding.source.device)
-        x0 = ddim_sample(lambda z, t: views.denoise(z, t.expand(len(z))), views.noise(), times, eta, views.noise)
-        self.images = (0.5 * (x0 + 1)).clamp(0, 1)
+        self.images = sample_views(views, sampler_steps, t_max, t_min, eta)
 
     def targets(self, step: int, rendered: Images) -> Images:
         return self.images

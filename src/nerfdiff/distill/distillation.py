@@ -7,7 +7,7 @@ import torch
 from lightning import Trainer
 
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.distill.prior import Prior
+from nerfdiff.distill.priors.prior import Prior
 from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.distill.strategy import Views
 from nerfdiff.distill.teacher import MakeTeacher

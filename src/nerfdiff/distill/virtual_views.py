@@ -30,7 +30,7 @@ class VirtualViews:
     def __init__(
         self, model: NerfDiff, encoding: Encoding, cameras: Cameras, views_at_once: int, seed: tuple[int | str, ...]
     ):
-        self.model, self.encoding, self.cameras = model, encoding, cameras
+        self.model, self.encoding, self.cameras, self.seed = model, encoding, cameras, seed
         self._parts = torch.arange(cameras.shape[1]).split(views_at_once)
         self._conditions: list[Condition] = []
         for part in self._parts:
@@ -65,8 +65,12 @@ class VirtualViews:
 
     def noise(self) -> Images:
         """Fresh standard normal images, each from its own view's stream."""
-        shape = self._conditions[0].rendered.shape[1:]
-        return torch.stack([torch.randn(shape, generator=g, device=g.device) for g in self._noise])
+        return torch.stack([self.noise_of(view) for view in range(len(self))])
+
+    def noise_of(self, view: int) -> Float[Tensor, "3 height width"]:
+        """A fresh standard normal image from one view's stream."""
+        source = self._noise[view]
+        return torch.randn(self._conditions[0].rendered.shape[1:], generator=source, device=source.device)
 
     def uniform(self) -> Float[Tensor, "views"]:
         """A fresh number in [0, 1) for every view, from its own stream."""

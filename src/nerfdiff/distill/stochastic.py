@@ -1,0 +1,60 @@
+"""3DiM's stochastic conditioning (Watson et al. 2022), on a CDM that is conditioned on renderings."""
+
+import torch
+
+from nerfdiff.diffusion.ddim import ddim_step, time_steps
+from nerfdiff.diffusion.denoiser import Condition
+from nerfdiff.distill.virtual_views import Images, VirtualViews
+from nerfdiff.randomness import generator
+
+
+class AutoregressiveViews:
+    """Views made one after another; each diffusion step is conditioned on one of those there are already.
+
+    3DiM's network takes a conditioning image and the relative pose. Ours takes a rendering and an encoder's features; so
+    to condition view k on view j, image j is encoded by itself, the resulting single-image NeRF rendered from camera k
+    relative to camera j, and its features attended to. At each step of view k, j is drawn from the input and the views
+    0 … k − 1. The field is then fitted to the views, as in direct distillation.
+
+    Args:
+        views: to make, in their order.
+        steps: how many times targets are asked for.
+        sampler_steps: DDIM steps from `t_max` to `t_min`.
+        eta: DDIM's η.
+    """
+
+    weight = None
+
+    @torch.no_grad()
+    def __init__(self, views: VirtualViews, steps: int, sampler_steps: int, t_max: float, t_min: float, eta: float):
+        self.steps = steps
+        self._views, model, encoding = views, views.model, views.encoding
+        frustum = encoding.triplane
+        self._encodings = [encoding]
+        choice = generator("cpu", *views.seed, "stochastic conditioning")
+        times = time_steps(sampler_steps, t_max, t_min, device=encoding.source.device)
+        images = []
+        for view in range(len(views)):
+            conditions: dict[int, Condition] = {}
+            z = views.noise_of(view)[None]
+            for t, t_next in zip(times[:-1], times[1:], strict=True):
+                known = int(torch.randint(len(self._encodings), (), generator=choice))
+                if known not in conditions:
+                    conditions[known] = self._condition(known, view)
+                x0 = model.denoiser(z, t[None], conditions[known])
+                views.denoiser_calls += 1
+                z = ddim_step(z, x0, t, t_next, eta, views.noise_of(view)[None] if eta > 0 else None)
+            images.append((0.5 * (x0 + 1)).clamp(0, 1))
+            self._encodings.append(model.encode(images[-1], frustum.cameras, frustum.near, frustum.far))
+        self.images = torch.cat(images)
+
+    def targets(self, step: int, rendered: Images) -> Images:
+        return self.images
+
+    def _condition(self, known: int, view: int) -> Condition:
+        """View `view` as seen from what is known: 0 is the input image, k + 1 is view k."""
+        cameras, model, encoding = self._views.cameras, self._views.model, self._encodings[known]
+        wanted = cameras[:, view : view + 1]
+        if known > 0:
+            wanted = wanted.relative_to(cameras[:, known - 1 : known])
+        return model.condition(encoding, wanted, model.render(encoding, wanted))

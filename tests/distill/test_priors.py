@@ -1,0 +1,137 @@
+"""Priors against cameras whose places are known, in worlds that the priors never see."""
+
+import numpy as np
+import pytest
+import torch
+
+from nerfdiff.cameras import Cameras
+from nerfdiff.data.batch import ViewBatch
+from nerfdiff.distill.priors.circle import Circle, plane_normal
+from nerfdiff.distill.priors.own_views import OwnViews
+from nerfdiff.distill.priors.prior import Prior, all_cameras
+from nerfdiff.distill.priors.sphere import Sphere
+from nerfdiff.distill.priors.srn_spiral import SRNSpiral
+from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.orbit import look_at_point
+
+K = torch.tensor([[20.0, 0, 9.0], [0, 20.0, 7.0], [0, 0, 1]])
+
+
+def camera(centre, target=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0)) -> np.ndarray:
+    """World camera of an OpenCV look-at, in plain numpy."""
+    centre, target = np.asarray(centre, float), np.asarray(target, float)
+    z = (target - centre) / np.linalg.norm(target - centre)
+    x = np.cross(z, up)
+    x /= np.linalg.norm(x)
+    c2w = np.eye(4)
+    c2w[:3] = np.stack([x, np.cross(z, x), z, centre], axis=1)
+    return c2w
+
+
+def scene(world: list[np.ndarray], near=0.8, far=1.8) -> ViewBatch:
+    """A batch of one scene, all in the space of the first camera."""
+    relative = torch.from_numpy(np.stack([np.linalg.inv(world[0]) @ c2w for c2w in world])).float()
+    cameras = Cameras(relative, K.expand(len(world), 3, 3), 14, 18)
+    pixels = torch.zeros(1, 3, 14, 18, dtype=torch.uint8)
+    return ViewBatch(
+        draws=torch.tensor([0]),
+        source_pixels=pixels,
+        source_cameras=cameras[:1],
+        target_pixels=pixels[:, None].expand(-1, len(world) - 1, -1, -1, -1),
+        target_cameras=cameras[None, 1:],
+        near=torch.tensor([near]),
+        far=torch.tensor([far]),
+        scene_ids=("a",),
+        source_views=("0",),
+        target_views=(tuple(str(k) for k in range(1, len(world))),),
+    )
+
+
+def spiral_pose(k: int, radius: float) -> np.ndarray:
+    elevation, azimuth = np.deg2rad(0.36 * k), 20 - 0.08 * k
+    direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    return camera(radius * np.array(direction))
+
+
+@pytest.mark.parametrize(("near", "far", "radius"), [(0.8, 1.8, 1.3), (1.25, 2.75, 2.0)])
+def test_srn_spiral_is_every_fifth_test_camera_relative_to_the_input_view(near, far, radius):
+    source = spiral_pose(64, radius)
+    cameras = SRNSpiral(50, 64)(scene([source, spiral_pose(0, radius)], near, far))
+    assert cameras.shape == (1, 50)
+    for k in (0, 7, 49):
+        expected = np.linalg.inv(source) @ spiral_pose(5 * k, radius)
+        np.testing.assert_allclose(cameras.c2w[0, k], expected, atol=2e-6)
+    assert torch.equal(cameras.K[0, 3], K)
+
+
+def test_own_views_are_the_inputs_and_the_others():
+    world = [camera(c) for c in ((2, 0, 1), (0, 2, 1.2), (-2, 0.3, 0.8), (1, -2, 0.5))]
+    batch = scene(world)
+    assert torch.equal(OwnViews(30)(batch).c2w[0], all_cameras(batch).c2w)
+    assert torch.equal(OwnViews(2)(batch).c2w[0], all_cameras(batch).c2w[[0, 2]])
+
+
+@pytest.mark.parametrize("start", [0.0, 1.1, 4.0])
+def test_the_circle_goes_through_clevrs_cameras_around_what_they_look_at(start):
+    """Equal heights and distances: the estimate is exact, and every true camera is on the circle."""
+    world = [camera((9 * np.cos(a), 9 * np.sin(a), 5.1)) for a in start + np.arange(3) * 2 * np.pi / 3]
+    batch = scene(world)
+    to_world = torch.from_numpy(world[0])
+    cameras = all_cameras(batch)
+    origin = to_world[:3, :3] @ look_at_point(cameras).double() + to_world[:3, 3]
+    up = to_world[:3, :3] @ plane_normal(cameras).double()
+    assert origin.norm() < 1e-4 and torch.allclose(up, torch.tensor([0.0, 0.0, 1.0]).double(), atol=1e-5)
+
+    virtual = Circle(48)(batch)
+    for k in range(48):
+        angle = start + 2 * np.pi * k / 48
+        expected = np.linalg.inv(world[0]) @ camera((9 * np.cos(angle), 9 * np.sin(angle), 5.1))
+        np.testing.assert_allclose(virtual.c2w[0, k], expected, atol=1e-4)
+
+
+def test_a_varying_distance_moves_the_circle_to_the_mean():
+    heights, radii = (4.8, 5.1, 5.6), (8.0, 9.0, 9.5)
+    angles = np.arange(3) * 2 * np.pi / 3
+    world = [camera((r * np.cos(a), r * np.sin(a), h)) for r, a, h in zip(radii, angles, heights, strict=True)]
+    virtual = Circle(36)(scene(world)).c2w[0].double()
+    centres = torch.from_numpy(world[0]) @ virtual[:, :, 3].T
+    # 0.8 of difference in height over 18 across tilts the plane by 0.05: that is the method's error, not ours
+    assert (centres[:2].norm(dim=0).mean() - np.mean(radii)).abs() < 0.1
+    assert (centres[2].mean() - np.mean(heights)).abs() < 0.1
+    assert (centres[2] - centres[2].mean()).abs().max() < 0.6
+
+
+def test_cameras_in_one_line_have_no_circle():
+    world = [camera((x, -5, 2), target=(x, 0, 0)) for x in (0.0, 1.0, 2.0)]
+    for views in (world, world[:2]):
+        with pytest.raises(DataError, match="at least three cameras"):
+            Circle(10)(scene(views))
+
+
+def test_the_sphere_surrounds_the_middle_at_the_inputs_distance_and_elevations():
+    source = camera((0, -1.3 * np.cos(0.35), 1.3 * np.sin(0.35)))
+    prior = Sphere(200, (-10.0, 60.0), (-180.0, 180.0), float(np.rad2deg(0.35)))
+    cameras = prior(scene([source, camera((1, 1, 1))]))
+    world = torch.from_numpy(source) @ cameras.c2w[0].double()
+    centres, forward, down = world[:, :3, 3], world[:, :3, 2], world[:, :3, 1]
+    assert (centres.norm(dim=-1) - 1.3).abs().max() < 1e-5
+    torch.testing.assert_close(forward, -centres / 1.3, atol=1e-5, rtol=0)
+    assert (down[:, 2] < 0).all(), "upright"
+    elevations = torch.rad2deg(torch.asin(centres[:, 2] / 1.3))
+    assert -10.01 < elevations.min() < -8 and 58 < elevations.max() < 60.01
+    azimuths = torch.rad2deg(torch.atan2(centres[:, 0], -centres[:, 1])).sort().values
+    assert azimuths.diff().max() < 10, "all around"
+
+
+def test_part_of_the_sphere_stays_on_the_inputs_side():
+    source = camera((0, -1.3, 0))
+    centres = Sphere(50, (0.0, 20.0), (-30.0, 30.0), 0.0)(scene([source, source])).c2w[0].double()
+    world = torch.from_numpy(source) @ centres[:, :, 3].T
+    assert torch.rad2deg(torch.atan2(world[0], -world[1])).abs().max() <= 30.001
+    with pytest.raises(ConfigError, match="elevation"):
+        Sphere(5, (30.0, 20.0), (0.0, 10.0), 0.0)
+
+
+def test_all_are_priors():
+    for prior in (SRNSpiral(5, 64), OwnViews(5), Circle(5), Sphere(5, (0.0, 1.0), (0.0, 1.0), 0.0)):
+        assert isinstance(prior, Prior)

@@ -85,7 +85,7 @@ def measured(model: NerfDiff, batch: ViewBatch) -> tuple[torch.Tensor, torch.Ten
         float(quality[0]),
         float(quality[1:].mean()),
         float(d.std() / t.std()),
-        float(torch.corrcoef(torch.stack([d, t]))[0, 1]),
+        float(torch.corrcoef(torch.stack([d, t]))[0, 1].nan_to_num(0)),  # NaN of a constant depth: none
         float(((d - t).abs() / t).mean()),
     ]
     return images, depth[None], row

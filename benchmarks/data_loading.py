@@ -3,8 +3,9 @@
     python benchmarks/data_loading.py data=srn_cars data.root=data/srn_cars
     python benchmarks/data_loading.py data=clevr3d data.root=data/clevr3d data.image_size=[60,80] --workers 0 4
 
-Times, in this order: reading the files, decoding them alone, the reader, the cached reader on random views, and the
-whole DataLoader. Each is warmed up, then measured several times; medians and quartiles are printed.
+Times, in this order: reading the files (images, and the masks that are read with them), decoding them alone, the
+reader, the cached reader on random views, and the whole DataLoader. Each is warmed up, then measured several times;
+medians and quartiles are printed.
 """
 
 import argparse
@@ -55,7 +56,7 @@ def measure(arguments: argparse.Namespace, data: DictConfig) -> list[tuple[str, 
     seconds = time.perf_counter() - start
     total = sum(len(cached.view_names(index)) for index in range(len(cached)))
     print(f"cache of {total} images: built in {seconds:.2f} s, {total / seconds:,.0f} images/s")
-    files = files_read(reader, arguments.images)
+    files, masks = files_read(reader, arguments.images)
 
     def repeated(function: Callable[[], int]) -> list[float]:
         function()
@@ -67,26 +68,47 @@ def measure(arguments: argparse.Namespace, data: DictConfig) -> list[tuple[str, 
         return rates
 
     results = [
-        ("read the files", repeated(lambda: sum(len(file.read_bytes()) > 0 for file in files))),
-        ("decode the files", repeated(lambda: sum(images.decode(file).shape[2] == 3 for file in files))),
+        ("read the files", repeated(lambda: read_alone(files, masks))),
+        ("decode the files", repeated(lambda: decode_alone(files, masks))),
         ("reader, 2 views at a time", repeated(lambda: load_pairs(reader, arguments.images))),
         ("cached reader, 2 views at a time", repeated(lambda: load_pairs(cached, arguments.images))),
     ]
-    steps = max(1, arguments.images // (2 * data.batch_size))
+    steps = max(1, arguments.images // (views_per_draw(data) * data.batch_size))
     for workers in arguments.workers:
         for cache in (False, True):
-            module = instantiate(data, num_workers=workers, cache=cache)
+            # a target that is its source would be an image that nobody decodes
+            module = instantiate(data, num_workers=workers, cache=cache, source_as_target=0.0)
             module.setup("fit")
-            rates = loader_rates(module, steps, arguments.repeats)
+            rates = loader_rates(module, steps, arguments.repeats, views_per_draw(data))
             results.append((f"DataLoader, {workers} workers, cache {'on' if cache else 'off'}", rates))
     return results
 
 
-def files_read(reader: SceneReader, count: int) -> list[Path]:
-    """The image files that the reader decodes for so many views."""
-    with patch.object(images, "decode", wraps=images.decode) as decode:
+def files_read(reader: SceneReader, count: int) -> tuple[list[Path], list[Path]]:
+    """The images, and the masks beside them, that the reader decodes for so many views."""
+    with (
+        patch.object(images, "decode", wraps=images.decode) as decode,
+        patch.object(images, "decode_mask", wraps=images.decode_mask) as decode_mask,
+    ):
         load_pairs(reader, count)
-    return [Path(call.args[0]) for call in decode.call_args_list]
+    return tuple([Path(call.args[0]) for call in calls.call_args_list] for calls in (decode, decode_mask))
+
+
+def read_alone(files: list[Path], masks: list[Path]) -> int:
+    """Images read, with their masks."""
+    return sum(len(file.read_bytes()) > 0 for file in [*files, *masks]) - len(masks)
+
+
+def decode_alone(files: list[Path], masks: list[Path]) -> int:
+    """Images decoded, with their masks."""
+    for mask in masks:
+        images.decode_mask(mask)
+    return sum(images.decode(file).shape[2] == 3 for file in files)
+
+
+def views_per_draw(data: DictConfig) -> int:
+    """Images that a draw takes: its source and its targets."""
+    return 1 + data.target_views
 
 
 def load_pairs(reader: SceneReader, count: int) -> int:
@@ -98,15 +120,18 @@ def load_pairs(reader: SceneReader, count: int) -> int:
     return count // 2 * 2
 
 
-def loader_rates(data: SceneDataModule, steps: int, repeats: int) -> list[float]:
-    """Rates of consecutive stretches of one loader, the first of which (workers starting) is dropped."""
+def loader_rates(data: SceneDataModule, steps: int, repeats: int, views: int) -> list[float]:
+    """Rates of consecutive stretches of one loader with so many views per draw.
+
+    The first stretch, in which workers start, is dropped.
+    """
     batches = iter(data.train_loader(0, 1, 1, start_step=0, total_steps=steps * (repeats + 1)))
     rates = []
     for _ in range(repeats + 1):
         start = time.perf_counter()
         for _ in range(steps):
             next(batches).targets  # noqa: B018 (floats, as the model reads them)
-        rates.append(2 * data.batch_size * steps / (time.perf_counter() - start))
+        rates.append(views * data.batch_size * steps / (time.perf_counter() - start))
     return rates[1:]
 
 

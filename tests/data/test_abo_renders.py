@@ -160,6 +160,15 @@ def test_views_are_read_in_the_order_asked_for(root):
     assert reader.load(0, [0, 2]).views == ("A_00", "A_02")
 
 
+@pytest.mark.parametrize("truth", [False, True])
+def test_each_image_is_decoded_once(root, truth, monkeypatch):
+    write_item(root / "A", views=4)
+    opened, open_image = [], Image.open
+    monkeypatch.setattr(Image, "open", lambda file: opened.append(Path(file).name) or open_image(file))
+    read(root).load(0, [2, 0], truth=truth)
+    assert opened == ["A_02.png", "A_00.png"]
+
+
 def test_images_without_alpha_have_no_mask(root):
     write_item(root / "A", views=2)
     Image.open(root / "A/A_00.png").convert("RGB").save(root / "A/A_00.png")

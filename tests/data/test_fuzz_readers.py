@@ -71,7 +71,9 @@ CASES = {
         lambda root, _: Clevr3DReader(root, "train", {"train": [0, 2]}, max_objects=5, **clevr_fixtures.SETTINGS),
     ),
     "nerfstudio": Case(
-        lambda root: [posed_fixtures.write_nerfstudio(root / f"train/s{k}", views=3, seed=k) for k in range(2)],
+        lambda root: [
+            posed_fixtures.write_nerfstudio(root / f"train/s{k}", views=3, seed=k, k1=-0.1 * k) for k in range(2)
+        ],
         lambda root, _: PosedImagesReader(root, "train", **posed_fixtures.SETTINGS),
     ),
     "blender": Case(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerfdiff.data.images import decode, decode_mask, resize, resize_nearest
+from nerfdiff.data.images import decode, decode_mask, decode_with_alpha, resize, resize_nearest
 from nerfdiff.errors import DataError
 
 
@@ -67,6 +67,15 @@ def test_mask(tmp_path):
     assert decode_mask(tmp_path / "m.png").tolist() == [[False, True, False, True]]
 
 
+@pytest.mark.parametrize("levels", [[0, 1], [0, 255]])
+def test_masks_of_zero_and_one_are_those_of_black_and_white(tmp_path, levels):
+    where = np.array([[True, False, False], [True, True, False]])
+    Image.fromarray(np.array(levels, np.uint8)[where.astype(int)]).save(tmp_path / "m.png")
+    assert np.array_equal(decode_mask(tmp_path / "m.png"), where)
+    Image.fromarray(np.zeros((2, 3), np.uint8)).save(tmp_path / "m.png")
+    assert not decode_mask(tmp_path / "m.png").any()
+
+
 @pytest.mark.parametrize("damage", [lambda b: b[: len(b) // 2], lambda b: b"", lambda b: b"no image at all" * 9])
 def test_damaged_files_are_named(tmp_path, rgb, damage):
     path = tmp_path / "000007.png"
@@ -103,3 +112,24 @@ def test_nearest_takes_values_that_exist():
     assert resize_nearest(values, (4, 6)).tolist() == values.tolist()
     assert resize_nearest(values, (2, 3)).tolist() == [[7, 9, 11], [19, 21, 23]]
     assert resize_nearest(values > 11, (2, 2)).tolist() == [[False, False], [True, True]]
+
+
+@pytest.mark.parametrize(("old", "new"), [(9, 3), (15, 3), (8, 4), (12, 2), (7, 5), (5, 7), (6, 18), (135, 16)])
+def test_nearest_is_nearest_to_the_new_centre_and_right_of_a_tie(old, new):
+    found = resize_nearest(np.arange(float(old))[None], (1, new))[0]
+    for k in range(new):
+        # centres, in units of 1 / (2 old new) of the image
+        distances = [abs((2 * k + 1) * old - (2 * value + 1) * new) for value in range(old)]
+        assert found[k] == max(value for value in range(old) if distances[value] == min(distances))
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "LA", "L", "I;16"])
+def test_alpha_comes_with_the_colours(tmp_path, mode, rgb):
+    alpha = np.linspace(0, 255, rgb.shape[0] * rgb.shape[1]).reshape(rgb.shape[:2]).astype(np.uint8)
+    image = Image.new("I;16", (5, 4)) if mode == "I;16" else Image.fromarray(np.dstack([rgb, alpha])).convert(mode)
+    image.save(tmp_path / "x.png")
+    pixels, opaque = decode_with_alpha(tmp_path / "x.png")
+    assert np.array_equal(pixels, decode(tmp_path / "x.png"))
+    assert (opaque is None) == ("A" not in mode)
+    if opaque is not None:
+        assert np.array_equal(opaque, alpha >= 128)

@@ -217,6 +217,24 @@ def test_bounds_are_estimated_and_said(tmp_path, caplog):
     assert f"those of shoe are {scene.near:.4g} and {scene.far:.4g}" in said and "data.reader.near" in said
 
 
+@pytest.mark.parametrize("stated", [True, False])
+def test_bounds_enclose_what_the_widest_view_shows(tmp_path, stated):
+    write_nerfstudio(tmp_path, views=20, per_frame=True)
+
+    def widen(content):
+        for frame in content["frames"] if not stated else ():
+            del frame["w"], frame["h"]
+        content["frames"][3] |= {"fl_x": FX / 3, "fl_y": FY / 3}
+
+    narrow = read(tmp_path).load(0, [0])
+    edit(tmp_path / "transforms.json", widen)
+    wide = read(tmp_path).load(0, [0])
+    radius = 3 * math.sin(math.atan(WIDTH / 2 / (FX / 3)))
+    assert wide.near < narrow.near and wide.far == pytest.approx(3.2 + radius, abs=0.15)
+    cropped = read(tmp_path, crop=20).load(0, [0])  # shows less of the object, but all of its depth
+    assert (cropped.near, cropped.far) == (wide.near, wide.far)
+
+
 def test_bounds_come_from_the_file_or_from_the_config(tmp_path, caplog):
     write_nerfstudio(tmp_path / "stated", near=1.0, far=5.0)
     assert [getattr(read(tmp_path).load(0, [0]), key) for key in ("near", "far")] == [1.0, 5.0]

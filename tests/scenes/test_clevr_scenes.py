@@ -217,6 +217,8 @@ def test_the_cylinder_is_closed_round_and_has_outward_normals():
         ("scenes.objects=[3,11]", "from 1 to 10"),
         ("scenes.objects=[5,3]", "ascending"),
         ("scenes.camera=[7.2,-6.8,3.0]", "horizon"),
+        ("scenes.camera=[7.2,-6.8]", "three numbers"),
+        ("scenes.objects=[few,6]", "from 1 to 10"),
         ("scenes.gap=-1", "at least 0"),
         ("+splits.train={scenes: 1, views: 3}", "one pool"),
     ],

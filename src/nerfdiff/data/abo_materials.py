@@ -33,9 +33,9 @@ from nerfdiff.data.framing import Framing
 from nerfdiff.data.index import cached_index, folder_stamp, index_name
 from nerfdiff.data.item_folders import item_folders
 from nerfdiff.data.optical_axes import ObjectCameras, check_settings, object_cameras, report
+from nerfdiff.data.pinhole import check_K
 from nerfdiff.data.scene import MissingSplit, Scene
 from nerfdiff.data.split_file import seeded_order
-from nerfdiff.data.srn_intrinsics import is_focal
 from nerfdiff.data.view_stack import stack_pixels
 from nerfdiff.errors import ConfigError, DataError, some
 
@@ -256,14 +256,8 @@ def _on_white(
 
 
 def _checked_K(folder: Path, stored: MaterialViews, position: int, size: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
-    K, (height, width) = stored.K[position], size
-    pinhole = is_focal(K[0, 0], width) and is_focal(K[1, 1], width) and 0 < K[0, 2] < width and 0 < K[1, 2] < height
-    if not pinhole or K[0, 1] or K[1, 0] or not np.array_equal(K[2], [0, 0, 1]):
-        raise DataError(
-            f"{folder / KEY_FILE}: view {stored.numbers[position]}: {K.tolist()} is no K of a {height}x{width} image; "
-            "expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels with a principal point inside the image"
-        )
-    return K
+    check_K(stored.K[position], *size, f"{folder / KEY_FILE}: view {stored.numbers[position]}")
+    return stored.K[position]
 
 
 def _stacked(values: Sequence[np.ndarray]) -> Tensor:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.data import images
-from nerfdiff.data.abo_transforms import IMAGES, KEY_FILE, Transforms
+from nerfdiff.data.abo_transforms import IMAGES, KEY_FILE, ItemTransforms
 from nerfdiff.data.framing import Framing
 from nerfdiff.data.index import folder_stamp
 from nerfdiff.data.item_folders import item_folders
@@ -100,21 +100,22 @@ class ABORenders:
 
     def view_names(self, index: int) -> tuple[str, ...]:
         if index not in self._views:
-            self._views[index] = Transforms.read(self.folders[index]).views
+            self._views[index] = ItemTransforms.read(self.folders[index]).views
         return self._views[index]
 
     def geometry(self, index: int) -> ObjectCameras:
         """All cameras of a scene as the file has them: what convention was found, and what they look at."""
-        return self._geometry(index, Transforms.read(self.folders[index]))
+        return self._geometry(index, ItemTransforms.read(self.folders[index]))
 
     def load(self, index: int, views: Sequence[int] | None = None, truth: bool = False) -> Scene:
-        transforms = Transforms.read(self.folders[index])
+        transforms = ItemTransforms.read(self.folders[index])
         geometry = self._geometry(index, transforms)
         report(self.root, geometry)
         positions = range(len(transforms.views)) if views is None else views
         names = tuple(transforms.views[p] for p in positions)
         files = [self.folders[index] / f"{name}.png" for name in names]
-        stored = [images.decode(file) for file in files]
+        decoded = [images.decode_with_alpha(file) if truth else (images.decode(file), None) for file in files]
+        stored = [image for image, _ in decoded]
         K = [
             self.framing.K(transforms.cameras[p].K(*image.shape[:2]), *image.shape[:2])
             for p, image in zip(positions, stored, strict=True)
@@ -128,17 +129,18 @@ class ABORenders:
             cameras=Cameras(torch.from_numpy(c2w).float(), torch.from_numpy(np.stack(K)).float(), *pixels.shape[-2:]),
             near=self.near,
             far=self.far,
-            mask=self._masks(files) if truth else None,
+            mask=self._masks([opaque for _, opaque in decoded]) if truth else None,
             depth=self._depth(files, [image.shape[:2] for image in stored], geometry) if truth else None,
         )
 
-    def _geometry(self, index: int, transforms: Transforms) -> ObjectCameras:
+    def _geometry(self, index: int, transforms: ItemTransforms) -> ObjectCameras:
         file = self.folders[index] / KEY_FILE
         return object_cameras(transforms.poses, self.convention, file, transforms.views)
 
-    def _masks(self, files: Sequence[Path]) -> Bool[Tensor, "views height width"] | None:
-        """Where the images are opaque; None where one of them has no alpha."""
-        masks = [images.decode_alpha(file) for file in files]
+    def _masks(
+        self, masks: Sequence[Bool[np.ndarray, "height width"] | None]
+    ) -> Bool[Tensor, "views new_height new_width"] | None:
+        """Framed: where the images are opaque; None where one of them has no alpha."""
         if any(mask is None for mask in masks):
             return None
         return torch.from_numpy(np.stack([self.framing.values(mask) for mask in masks]))

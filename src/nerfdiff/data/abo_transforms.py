@@ -17,7 +17,7 @@ IMAGES = r"{item}_\d+\.png"
 
 
 @dataclass(frozen=True)
-class Transforms:
+class ItemTransforms:
     """What the file says of its views, in the order of the numbers at the ends of their names."""
 
     views: tuple[str, ...]
@@ -25,7 +25,7 @@ class Transforms:
     cameras: tuple[BlenderCamera, ...]
 
     @staticmethod
-    def read(folder: Path) -> "Transforms":
+    def read(folder: Path) -> "ItemTransforms":
         """Parse `<folder>/transforms.json`, and compare it with the images beside it.
 
         A frame's `file_path` is a path of its author's, without suffix: only its last part counts.
@@ -51,7 +51,7 @@ class Transforms:
             parsed[name] = pose, camera
         _require_images(folder, set(parsed))
         views = tuple(sorted(parsed, key=_number))
-        return Transforms(views, np.stack([parsed[v][0] for v in views]), tuple(parsed[v][1] for v in views))
+        return ItemTransforms(views, np.stack([parsed[v][0] for v in views]), tuple(parsed[v][1] for v in views))
 
 
 def _number(name: str) -> tuple[int, str]:

@@ -35,7 +35,7 @@ class ViewBatch:
 
     Args:
         draws: each sample's `draw`, which seeds whatever noise the sample needs.
-        source_pixels, target_pixels: 8-bit colours on white.
+        source_pixels, target_pixels: 8-bit colours.
         source_cameras: [B]; `c2w` is the identity.
         target_cameras: [B, T]; relative to the source camera.
         near, far: bounds as distances along rays, in scene units.

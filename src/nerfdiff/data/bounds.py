@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
+from nerfdiff.data.optical_axes import closest_point
 from nerfdiff.errors import DataError
 
 MIN_SPREAD = 0.005
@@ -36,10 +37,8 @@ class Gaze:
     def of(c2w: Float[np.ndarray, "views 4 4"]) -> "Gaze":
         """From camera-to-world matrices with OpenCV axes."""
         axes, centres = c2w[:, :3, 2], c2w[:, :3, 3]
-        # The distance of point p from axis d through C is that of (I − d dᵀ)(p − C) from 0
-        across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+        point, across = closest_point(c2w)
         spread = np.linalg.eigvalsh(across.mean(0))[0]
-        point = np.linalg.lstsq(across.sum(0), np.einsum("vij,vj->i", across, centres), rcond=None)[0]
         offsets = point - centres
         return Gaze(
             point,
@@ -70,7 +69,8 @@ class Gaze:
         for images framed around an object is what they were framed by.
 
         Args:
-            half_angle: half the field of view along the wider side, in radians.
+            half_angle: half the field of view along the wider side, in radians, of the widest image as it was framed:
+                what is cropped later shows less of an object, but no less of its depth.
 
         Raises:
             DataError: the axes are near parallel, or no camera looks at where they meet.

@@ -20,15 +20,15 @@ from nerfdiff.data import images
 from nerfdiff.data.clevr3d_metadata import camera_positions, object_counts
 from nerfdiff.data.framing import Framing
 from nerfdiff.data.index import folder_stamp
+from nerfdiff.data.pinhole import ASPECT_TOLERANCE
 from nerfdiff.data.scene import MissingSplit, Scene
 from nerfdiff.data.view_stack import stack_pixels
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.errors import ConfigError, DataError, some
 
 PARENTS = ("", "clevr3d")
 DEPTH_RANGE = 40.0
 """Distance in scene units that the 2^16 levels of a depth image span: the renderer multiplied by 0.025."""
 DEPTH_LEVELS = 2**16
-ASPECT_TOLERANCE = 0.02
 
 
 class Clevr3DReader:
@@ -211,8 +211,8 @@ def _find_root(root: Path) -> Path:
     wanted = "metadata.npz and images/ (or clevr3d/ with these in it)"
     if not root.is_dir():
         raise DataError(f"{root}: no such folder; set data.root to the folder that holds {wanted}")
-    found = sorted(entry.name for entry in root.iterdir())[:8]
-    raise DataError(f"{root}: expected {wanted}, found {', '.join(found) or 'an empty folder'}")
+    found = sorted(entry.name for entry in root.iterdir())
+    raise DataError(f"{root}: expected {wanted}, found {some(found) if found else 'an empty folder'}")
 
 
 def _look_at_able(

@@ -68,7 +68,7 @@ class Draws:
         """How far the camera of a target that is the source itself is moved; None without noise.
 
         Seen from exactly where it was taken, an input view is explained by a plane in front of the camera (paper,
-        appendix, "Clevr3D").
+        appendix, "Training phase").
         """
         if not self.source_target_noise:
             return None

@@ -17,24 +17,36 @@ def decode(path: Path) -> UInt8[np.ndarray, "height width 3"]:
     Raises:
         DataError: the file is missing, truncated or no image.
     """
-    image = _open(path)
-    if image.mode.startswith("I"):  # 16-bit grey, which Pillow would clip rather than scale
-        grey = (np.asarray(image) >> 8).astype(np.uint8)
-        return np.repeat(grey[..., None], 3, axis=-1)
-    if not image.has_transparency_data:
-        return np.asarray(image.convert("RGB"))
-    rgba = np.asarray(image.convert("RGBA")).astype(np.uint16)
-    colour, alpha = rgba[..., :3], rgba[..., 3:]
-    return ((colour * alpha + 255 * (255 - alpha) + 127) // 255).astype(np.uint8)
+    return decode_with_alpha(path)[0]
 
 
-def decode_mask(path: Path) -> Bool[np.ndarray, "height width"]:
-    """Decode an 8-bit mask: foreground is above half of white.
+def decode_with_alpha(
+    path: Path,
+) -> tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"] | None]:
+    """`decode`, and where the image is more than half opaque; None where it has no transparency.
 
     Raises:
         DataError: as `decode`.
     """
-    return np.asarray(_open(path).convert("L")) > 127
+    image = _open(path)
+    if image.mode.startswith("I"):  # 16-bit grey, which Pillow would clip rather than scale
+        grey = (np.asarray(image) >> 8).astype(np.uint8)
+        return np.repeat(grey[..., None], 3, axis=-1), None
+    if not image.has_transparency_data:
+        return np.asarray(image.convert("RGB")), None
+    rgba = np.asarray(image.convert("RGBA"))
+    colour, alpha = rgba[..., :3].astype(np.uint16), rgba[..., 3:].astype(np.uint16)
+    return ((colour * alpha + 255 * (255 - alpha) + 127) // 255).astype(np.uint8), rgba[..., 3] > 127
+
+
+def decode_mask(path: Path) -> Bool[np.ndarray, "height width"]:
+    """Decode an 8-bit mask: foreground is above half of white or, where there are only 0 and 1, 1.
+
+    Raises:
+        DataError: as `decode`.
+    """
+    grey = np.asarray(_open(path).convert("L"))
+    return grey > (0 if grey.max() == 1 else 127)
 
 
 def stored_size(path: Path) -> tuple[int, int]:
@@ -45,18 +57,6 @@ def stored_size(path: Path) -> tuple[int, int]:
     """
     with _readable(path), Image.open(path) as image:
         return image.height, image.width
-
-
-def decode_alpha(path: Path) -> Bool[np.ndarray, "height width"] | None:
-    """Where an image is more than half opaque; None where it has no transparency.
-
-    Raises:
-        DataError: as `decode`.
-    """
-    image = _open(path)
-    if not image.has_transparency_data:
-        return None
-    return np.asarray(image.convert("RGBA"))[..., 3] > 127
 
 
 def decode_levels(path: Path) -> Integer[np.ndarray, "height width"]:
@@ -91,10 +91,13 @@ def resize(
 def resize_nearest(
     values: Float[np.ndarray, "height width"] | Bool[np.ndarray, "height width"], size: tuple[int, int]
 ) -> Float[np.ndarray, "new_height new_width"] | Bool[np.ndarray, "new_height new_width"]:
-    """Resize depth or masks, whose values must not be averaged over an edge."""
-    rows, columns = (
-        ((np.arange(new) + 0.5) * old / new).astype(int) for new, old in zip(size, values.shape, strict=True)
-    )
+    """Resize depth or masks, whose values must not be averaged over an edge: each new pixel takes the value whose
+    centre is nearest to its own.
+
+    By an even factor the new centre lies on the border of two old pixels, of which the right or lower one is taken:
+    no choice of stored values avoids that half an old pixel, and this one is the same at every pixel.
+    """
+    rows, columns = ((2 * np.arange(new) + 1) * old // (2 * new) for new, old in zip(size, values.shape, strict=True))
     return values[rows[:, None], columns]
 
 

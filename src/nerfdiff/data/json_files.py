@@ -55,6 +55,15 @@ def number(values: Any, key: str, where: str | Path, default: float | None = Non
     return float(value)
 
 
+def optional_number(values: Any, key: str, where: str | Path) -> float | None:
+    """The finite number `values[key]`; None where the key is not there or its value is null.
+
+    Raises:
+        DataError: the value is anything else.
+    """
+    return None if isinstance(values, Mapping) and values.get(key) is None else number(values, key, where)
+
+
 def matrix(value: Any, rows: int, columns: int, where: str | Path) -> Float[np.ndarray, "rows columns"]:
     """Numbers as a matrix, whether nested by rows or in one row-major list.
 

@@ -129,15 +129,27 @@ def report(root: Path, found: ObjectCameras) -> None:
     reported.add((found.convention, found.inverted))
 
 
+def closest_point(
+    c2w: Float[np.ndarray, "views 4 4"],
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "views 3 3"]]:
+    """The point closest to all optical axes (the z axes) in the least-squares sense; of no meaning where these are
+    near parallel.
+
+    Returns:
+        the point p, and I − d dᵀ of each axis d: the distance of p from axis d through C is that of (I − d dᵀ)(p − C)
+        from 0.
+    """
+    axes, centres = c2w[:, :3, 2], c2w[:, :3, 3]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    return np.linalg.lstsq(across.sum(0), np.einsum("vij,vj->i", across, centres), rcond=None)[0], across
+
+
 def _meet(c2w: Float[np.ndarray, "views 4 4"], inverted: bool) -> ObjectCameras | None:
     """Intersect the optical axes; None where they do not meet, or meet only at the cameras themselves."""
-    axes, centres = c2w[:, :3, 2], c2w[:, :3, 3]
-    # The distance of point p from axis d through C is that of (I − d dᵀ)(p − C) from 0
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    normal = across.sum(0)
-    if np.linalg.cond(normal) > 1e10:  # parallel axes meet nowhere, or everywhere
+    centres = c2w[:, :3, 3]
+    point, across = closest_point(c2w)
+    if np.linalg.cond(across.sum(0)) > 1e10:  # parallel axes meet nowhere, or everywhere
         return None
-    point = np.linalg.solve(normal, np.einsum("vij,vj->i", across, centres))
     distance = np.linalg.norm(point - centres, axis=1).mean()
     # Inverted poses that look at the origin have their translations, and so their axes, in one place
     if distance < 1e-6 * np.abs(centres).max():

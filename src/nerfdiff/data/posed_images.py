@@ -4,7 +4,8 @@
     <root>/<scene>/transforms.json                      splits drawn from a seed
     <root>/transforms.json                              one scene, which is every split
 
-What the files hold is said in `transforms_json`. Scenes may have any scale: density is per depth of the frustum, and
+What the files hold is said in `transforms_json`. Images of lenses that distort are undistorted as they are read,
+with their K and size kept (`lens.Lens`). Scenes may have any scale: density is per depth of the frustum, and
 near and far come from each scene's own cameras.
 """
 
@@ -17,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.data import images
@@ -132,13 +133,9 @@ class PosedImagesReader:
         every = scene.transforms.frames
         frames = every if views is None else [every[view] for view in views]
         files = [find_image(frame.image) for frame in frames]
-        stored = [images.decode(file) for file in files]
-        sizes = [image.shape[:2] for image in stored]
-        K = [self.framing.K(f.pinhole.K(*size), *size) for f, size in zip(frames, sizes, strict=True)]
-        masks = [_mask(frame, size) for frame, size in zip(frames, sizes, strict=True)]
-        if self.white_background:
-            stored = [_on_white(image, mask) for image, mask in zip(stored, masks, strict=True)]
-        pixels = stack_pixels([self.framing.image(image) for image in stored], files)
+        opened = [self._open(frame, file, truth) for frame, file in zip(frames, files, strict=True)]
+        pixels = stack_pixels([self.framing.image(image) for image, _, _ in opened], files)
+        K = [self.framing.K(k, *image.shape[:2]) for image, _, k in opened]
         c2w = np.stack([frame.c2w for frame in frames])
         return Scene(
             id=self.scene_id(index),
@@ -147,8 +144,22 @@ class PosedImagesReader:
             cameras=Cameras(torch.from_numpy(c2w).float(), torch.from_numpy(np.stack(K)).float(), *pixels.shape[-2:]),
             near=scene.near,
             far=scene.far,
-            mask=self._truth(files, masks) if truth else None,
+            mask=self._truth([mask for _, mask, _ in opened]) if truth else None,
         )
+
+    def _open(
+        self, frame: Frame, file: Path, truth: bool
+    ) -> tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"] | None, Float[np.ndarray, "3 3"]]:
+        """A frame's image, its foreground by mask or else, where `truth` asks for it, by transparency, and its K."""
+        image, opaque = images.decode_with_alpha(file) if truth else (images.decode(file), None)
+        K, mask = frame.pinhole.K(*image.shape[:2]), _mask(frame, image.shape[:2])
+        foreground = opaque if mask is None else mask
+        if frame.lens is not None:
+            image = frame.lens.image(image, K)
+            foreground = None if foreground is None else frame.lens.mask(foreground, K)
+        if self.white_background and mask is not None:
+            image = np.where(foreground[..., None], image, np.uint8(255))
+        return image, foreground, K
 
     def _scene(self, index: int) -> _PosedScene:
         parsed = self._parsed.get(index)
@@ -167,7 +178,7 @@ class PosedImagesReader:
         near = self.near if self.near is not None else transforms.near
         far = self.far if self.far is not None else transforms.far
         if near is None or far is None:
-            estimated = gaze.bounds(_half_angle(transforms.frames[0]), folder)
+            estimated = gaze.bounds(_half_angle(transforms.frames), folder)
             near, far = estimated[0] if near is None else near, estimated[1] if far is None else far
         if not 0 < near < far < MAX_POSITION:
             raise DataError(
@@ -176,19 +187,27 @@ class PosedImagesReader:
             )
         return _PosedScene(transforms, float(near), float(far))
 
-    def _truth(self, files: Sequence[Path], masks: Sequence[np.ndarray | None]) -> torch.Tensor | None:
-        """Foreground by mask, or else by transparency; None where a view has neither."""
-        found = [images.decode_alpha(f) if mask is None else mask for f, mask in zip(files, masks, strict=True)]
-        if any(mask is None for mask in found):
+    def _truth(
+        self, foreground: Sequence[Bool[np.ndarray, "height width"] | None]
+    ) -> Bool[torch.Tensor, "views new_height new_width"] | None:
+        """The views' framed foreground; None where one of them has neither mask nor transparency."""
+        if any(mask is None for mask in foreground):
             return None
-        return torch.from_numpy(np.stack([self.framing.values(mask) for mask in found]))
+        return torch.from_numpy(np.stack([self.framing.values(mask) for mask in foreground]))
 
 
-def _half_angle(frame: Frame) -> float:
-    """Half the field of view along the wider side of an image, as it is stored."""
-    height, width = images.stored_size(find_image(frame.image))
-    K = frame.pinhole.K(height, width)
-    return math.atan(max(width / K[0, 0], height / K[1, 1]) / 2)
+def _half_angle(frames: Sequence[Frame]) -> float:
+    """Half the widest field of view among the frames, along the wider side of an image as it is stored.
+
+    Where no size is stated, frames that share their intrinsics share the size of the first one's image.
+    """
+    widest = 0.0
+    cameras = {(f.pinhole.focal, f.pinhole.angle, f.pinhole.centre, f.pinhole.size): f for f in reversed(frames)}
+    for frame in cameras.values():
+        height, width = map(round, frame.pinhole.size or images.stored_size(find_image(frame.image)))
+        K = frame.pinhole.K(height, width)
+        widest = max(widest, math.atan(max(width / K[0, 0], height / K[1, 1]) / 2))
+    return widest
 
 
 def _mask(frame: Frame, size: tuple[int, int]) -> Bool[np.ndarray, "height width"] | None:
@@ -201,12 +220,6 @@ def _mask(frame: Frame, size: tuple[int, int]) -> Bool[np.ndarray, "height width
             f"{size[0]}x{size[1]}"
         )
     return mask
-
-
-def _on_white(
-    image: UInt8[np.ndarray, "height width 3"], mask: Bool[np.ndarray, "height width"] | None
-) -> UInt8[np.ndarray, "height width 3"]:
-    return image if mask is None else np.where(mask[..., None], image, np.uint8(255))
 
 
 def _visible(folder: Path) -> list[Path]:

@@ -22,7 +22,8 @@ class Scene:
     Args:
         id: the scene's name within its dataset.
         views: names (file stems) of the views, in the order of `pixels`.
-        pixels: 8-bit colours, composited on white (they become floats only where they are used).
+        pixels: 8-bit colours, what is transparent or masked out being white (they become floats only where they are
+            used).
         cameras: one camera per image, in the dataset's world.
         near, far: bounds of the scene as distances along rays, in scene units.
         mask: foreground, where the dataset knows it.
@@ -55,7 +56,10 @@ class SceneReader(Protocol):
         """Number of scenes."""
 
     def fingerprint(self) -> str:
-        """Digest of the files that images and cameras come from (names, sizes, times of change)."""
+        """Digest of names and times of change of the files, or of their folders, that images and cameras come from.
+
+        Each reader says which changes it does not notice.
+        """
 
     def scene_id(self, index: int) -> str:
         """Name of scene `index` within the dataset."""

@@ -6,13 +6,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from nerfdiff.data.pinhole import ASPECT_TOLERANCE, check_K, is_focal
 from nerfdiff.data.posed_files import read_numbers, read_text
 from nerfdiff.errors import DataError
-
-ASPECT_TOLERANCE = 0.02
-"""How far the two scale factors may differ by rounding of the image size (640×480 stored as 107×80)."""
-FOCAL_RANGE = (1e-3, 1e5)
-"""Of focal lengths relative to the image's width: fields of view of 179.9° and of 2 seconds of arc."""
 
 
 @dataclass(frozen=True)
@@ -71,11 +67,6 @@ class SceneIntrinsics:
         return np.array([[self.f * sx, 0, self.cx * sx], [0, self.f * sy, self.cy * sy], [0, 0, 1]])
 
 
-def is_focal(f: float, width: float) -> bool:
-    """Whether a lens can have a focal length of `f` pixels in images of this width."""
-    return bool(FOCAL_RANGE[0] * width < f < FOCAL_RANGE[1] * width)
-
-
 def read_view_intrinsics(path: Path, height: int, width: int) -> Float[np.ndarray, "3 3"]:
     """`intrinsics/<view>.txt`: a 3×3 K of the stored image.
 
@@ -83,10 +74,5 @@ def read_view_intrinsics(path: Path, height: int, width: int) -> Float[np.ndarra
         DataError: the numbers are no K of an image of `height` × `width`.
     """
     K = read_numbers(path, (9,), "a row-major 3x3 K").reshape(3, 3)
-    pinhole = is_focal(K[0, 0], width) and is_focal(K[1, 1], width) and 0 < K[0, 2] < width and 0 < K[1, 2] < height
-    if not pinhole or K[0, 1] or K[1, 0] or not np.array_equal(K[2], [0, 0, 1]):
-        raise DataError(
-            f"{path}: {K.tolist()} is no K of a {height}x{width} image; expected [[fx, 0, cx], [0, fy, cy], "
-            "[0, 0, 1]] in pixels with a principal point inside the image"
-        )
+    check_K(K, height, width, path)
     return K

@@ -3,23 +3,25 @@
     {"fl_x", "fl_y", "cx", "cy", "w", "h", "frames": [{"file_path": "images/1.jpg", "transform_matrix", "mask_path"}]}
     {"camera_angle_x", "frames": [{"file_path": "./train/r_0", "transform_matrix"}]}
 
-Intrinsics may stand in a frame as well as beside the frames. `transform_matrix` is camera-to-world with OpenGL axes
-(x right, y up, looking along −z). Where both kinds of file are there, `transforms.json` is read.
+Intrinsics, and distortion (`lens.Lens`), may stand in a frame as well as beside the frames. `transform_matrix` is
+camera-to-world with OpenGL axes (x right, y up, looking along −z). Where both kinds of file are there,
+`transforms.json` is read.
 """
 
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.data.json_files import entry, matrix, read_json
+from nerfdiff.data.json_files import entry, matrix, optional_number, read_json
+from nerfdiff.data.lens import Lens
 from nerfdiff.data.posed_files import check_rigid
-from nerfdiff.data.transforms_pinhole import Pinhole, number
+from nerfdiff.data.transforms_pinhole import Pinhole
 from nerfdiff.errors import DataError
 
 ONE_FILE = "transforms.json"
@@ -38,6 +40,7 @@ class Frame:
         image, mask: files; the image's suffix may be missing, see `find_image`.
         c2w: camera-to-world with OpenCV axes.
         pinhole: its intrinsics.
+        lens: its distortion; None where there is none.
     """
 
     name: str
@@ -45,6 +48,7 @@ class Frame:
     mask: Path | None
     c2w: Float[np.ndarray, "4 4"]
     pinhole: Pinhole
+    lens: Lens | None
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ def read_transforms(folder: Path, convention: str = "opengl") -> Transforms:
 
     Raises:
         DataError: there is no such file; or one is damaged, has no frames, poses that are not rigid, wrong or no
-            intrinsics, lens distortion, or a view twice.
+            intrinsics, a lens that is not read, or a view twice.
     """
     names = [ONE_FILE] if (folder / ONE_FILE).is_file() else [n for n in SPLIT_FILES if (folder / n).is_file()]
     if not names:
@@ -88,8 +92,8 @@ def read_transforms(folder: Path, convention: str = "opengl") -> Transforms:
     for file in (folder / name for name in names):
         content = read_json(file, "expected posed images as a JSON object with the key 'frames'")
         frames += _frames(file, content, convention)
-        near = number(content, "near", file) if near is None else near
-        far = number(content, "far", file) if far is None else far
+        near = optional_number(content, "near", file) if near is None else near
+        far = optional_number(content, "far", file) if far is None else far
     frames = _named(folder / names[0], frames)
     _refuse_far_away(folder / names[0], np.stack([frame.c2w[:3, 3] for frame in frames]))
     return Transforms(tuple(frames), near, far)
@@ -124,8 +128,9 @@ def _frames(file: Path, content: Mapping[str, Any], convention: str) -> list[Fra
         mask = None
         if frame.get("mask_path") is not None:
             mask = file.parent / _relative(entry(frame, "mask_path", str, where), "mask_path", where)
-        pinhole = Pinhole.read({**content, **frame}, where)
-        frames.append(Frame(str(path), file.parent / path, mask, c2w, pinhole))
+        camera = {**content, **frame}
+        lens, pinhole = Lens.read(camera, where), Pinhole.read(camera, where)
+        frames.append(Frame(str(path), file.parent / path, mask, c2w, pinhole, lens))
     return frames
 
 
@@ -153,7 +158,7 @@ def _named(file: Path, frames: Sequence[Frame]) -> list[Frame]:
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise DataError(f"{file}: {len(twice)} views are there twice, first {twice[0]}; expected one frame per image")
-    named = [Frame(n, f.image, f.mask, f.c2w, f.pinhole) for n, f in zip(names, frames, strict=True)]
+    named = [replace(frame, name=name) for name, frame in zip(names, frames, strict=True)]
     return sorted(named, key=lambda frame: (re.sub(r"\d+", lambda digits: digits[0].zfill(20), frame.name), frame.name))
 
 

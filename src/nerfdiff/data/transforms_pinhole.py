@@ -3,21 +3,14 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.data.srn_intrinsics import ASPECT_TOLERANCE, is_focal
+from nerfdiff.data.json_files import optional_number
+from nerfdiff.data.pinhole import ASPECT_TOLERANCE, is_focal
 from nerfdiff.errors import DataError
-
-DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
-"""Camera models that are a pinhole where their distortion is zero."""
-UNDISTORT = (
-    "undistort the images (COLMAP's image_undistorter does, and gives the new intrinsics) and write the file for these"
-)
 
 
 @dataclass(frozen=True)
@@ -43,11 +36,10 @@ class Pinhole:
         """From the keys of a frame and, where it lacks them, of its file.
 
         Raises:
-            DataError: there are no intrinsics, they are no pinhole's, or the lens distorts.
+            DataError: there are no intrinsics, or they are no pinhole's.
         """
-        _refuse_distortion(values, where)
         keys = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y")
-        fx, fy, cx, cy, w, h, angle_x, angle_y = (number(values, key, where) for key in keys)
+        fx, fy, cx, cy, w, h, angle_x, angle_y = (optional_number(values, key, where) for key in keys)
         if fx is None and angle_x is None:
             raise DataError(f"{where}: no intrinsics; expected 'fl_x' (pixels) or 'camera_angle_x' (radians)")
         for one, other, names in ((cx, cy, "'cx' and 'cy'"), (w, h, "'w' and 'h'")):
@@ -94,31 +86,3 @@ class Pinhole:
                 "expected 'cx' and 'cy' in pixels, and 'w' and 'h' where the images are stored at another resolution"
             )
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-
-
-def number(values: Mapping[str, Any], key: str, where: str | Path) -> float | None:
-    """A finite number, or None where the key is missing or null.
-
-    Raises:
-        DataError: the value is anything else.
-    """
-    value = values.get(key)
-    if value is None:
-        return None
-    try:
-        if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
-            return float(value)
-    except OverflowError:
-        pass
-    raise DataError(f"{where}: expected a finite number as {key!r}, found {repr(value)[:80]}")
-
-
-def _refuse_distortion(values: Mapping[str, Any], where: str) -> None:
-    model = values.get("camera_model")
-    if (model is not None and model not in PERSPECTIVE) or values.get("is_fisheye"):
-        shown = "a fisheye" if model is None or model in PERSPECTIVE else repr(model)[:80]
-        raise DataError(f"{where}: the camera is {shown}, only pinholes are read; {UNDISTORT}")
-    distorting = {key: k for key in DISTORTION if (k := number(values, key, where))}
-    if distorting:
-        shown = ", ".join(f"{key} = {value:g}" for key, value in distorting.items())
-        raise DataError(f"{where}: the lens distorts ({shown}), only pinholes are read; {UNDISTORT}")

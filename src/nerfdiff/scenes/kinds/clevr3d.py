@@ -79,7 +79,10 @@ class Clevr3DScenes:
         for key in ("extent", "gap", "jitter", "lamp_jitter"):
             if not scenes[key] >= 0:
                 raise ConfigError(f"scenes.{key}={scenes[key]}: expected at least 0")
-        x, y, z = camera = tuple(scenes["camera"])
+        camera = tuple(scenes["camera"])
+        if len(camera) != 3 or not all(isinstance(value, (int, float)) for value in camera):
+            raise ConfigError(f"scenes.camera={list(camera)}: expected three numbers, x, y and z")
+        x, y, z = camera
         # Rays at the top of the image still meet the floor: the background is floor, never nothing.
         lowest = np.arctan2(z - scenes["jitter"], np.hypot(x, y) + np.sqrt(2) * scenes["jitter"])
         if not lowest > np.arctan(0.375 / FOCAL_PER_WIDTH) + 0.02:

@@ -85,6 +85,7 @@ def check_splits(splits: Mapping[str, Any], known: Sequence[str], category: str)
 
 def ascending(name: str, values: Sequence[Any], low: float, high: float = float("inf")) -> tuple[Any, Any]:
     """Two values low <= a <= b <= high, or a `ConfigError` naming the key."""
-    if len(values) != 2 or not low <= values[0] <= values[1] <= high:
+    numbers = len(values) == 2 and all(isinstance(value, (int, float)) for value in values)
+    if not numbers or not low <= values[0] <= values[1] <= high:
         raise ConfigError(f"{name}={list(values)}: expected two ascending numbers from {low:g} to {high:g}")
     return tuple(values)

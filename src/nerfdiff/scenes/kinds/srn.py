@@ -26,7 +26,7 @@ from nerfdiff.scenes.car_proportions import STYLES as CAR_STYLES
 from nerfdiff.scenes.cars import build_car
 from nerfdiff.scenes.chairs import STYLES as CHAIR_STYLES
 from nerfdiff.scenes.chairs import build_chair
-from nerfdiff.scenes.kinds.kind import SceneJob, check_splits, check_styles, stream
+from nerfdiff.scenes.kinds.kind import SceneJob, ascending, check_splits, check_styles, stream
 from nerfdiff.scenes.mesh import Model
 from nerfdiff.scenes.mitsuba_model import ModelWorld
 from nerfdiff.scenes.mitsuba_renderer import Film, MitsubaRenderer
@@ -64,9 +64,9 @@ class SRNScenes:
                 raise ConfigError(f"splits.{split}.views={wanted['views']}: the spiral has {SPIRAL_VIEWS} views")
         if not scenes["radius"] > 0.5:
             raise ConfigError(f"scenes.radius={scenes['radius']}: expected more than 0.5, outside the object")
-        low, high = scenes["elevation"]
-        if not -90 <= low < high <= 90:
-            raise ConfigError(f"scenes.elevation=[{low}, {high}]: expected two ascending degrees from -90 to 90")
+        low, high = ascending("scenes.elevation", scenes["elevation"], -90, 90)
+        if low == high:
+            raise ConfigError(f"scenes.elevation=[{low}, {high}]: expected two different degrees")
         fov = float(np.rad2deg(2 * np.arctan(0.5 / FOCAL_PER_PIXEL)))
         film = Film(cfg["resolution"], cfg["resolution"], fov, cfg["samples_per_pixel"])
         return cls(scenes["category"], film, cfg["seed"], scenes["radius"], (low, high), scenes["styles"])

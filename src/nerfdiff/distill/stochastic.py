@@ -1,5 +1,7 @@
 """3DiM's stochastic conditioning (Watson et al. 2022), on a CDM that is conditioned on renderings."""
 
+from itertools import pairwise
+
 import torch
 
 from nerfdiff.diffusion.ddim import ddim_step, time_steps
@@ -11,8 +13,8 @@ from nerfdiff.randomness import generator
 class AutoregressiveViews:
     """Views made one after another; each diffusion step is conditioned on one of those there are already.
 
-    3DiM's network takes a conditioning image and the relative pose. Ours takes a rendering and an encoder's features; so
-    to condition view k on view j, image j is encoded by itself, the resulting single-image NeRF rendered from camera k
+    3DiM's network takes a conditioning image and the relative pose. Ours takes a rendering and an encoder's features;
+    so to condition view k on view j, image j is encoded by itself, the resulting single-image NeRF rendered from camera k
     relative to camera j, and its features attended to. At each step of view k, j is drawn from the input and the views
     0 … k − 1. The field is then fitted to the views, as in direct distillation.
 
@@ -37,7 +39,7 @@ class AutoregressiveViews:
         for view in range(len(views)):
             conditions: dict[int, Condition] = {}
             z = views.noise_of(view)[None]
-            for t, t_next in zip(times[:-1], times[1:], strict=True):
+            for t, t_next in pairwise(times):
                 known = int(torch.randint(len(self._encodings), (), generator=choice))
                 if known not in conditions:
                     conditions[known] = self._condition(known, view)

@@ -14,9 +14,9 @@ class AutoregressiveViews:
     """Views made one after another; each diffusion step is conditioned on one of those there are already.
 
     3DiM's network takes a conditioning image and the relative pose. Ours takes a rendering and an encoder's features;
-    so to condition view k on view j, image j is encoded by itself, the resulting single-image NeRF rendered from camera k
-    relative to camera j, and its features attended to. At each step of view k, j is drawn from the input and the views
-    0 … k − 1. The field is then fitted to the views, as in direct distillation.
+    so to condition view k on view j, image j is encoded by itself, the resulting single-image NeRF rendered from
+    camera k relative to camera j, and its features attended to. At each step of view k, j is drawn from the input and
+    the views 0 … k − 1. The field is then fitted to the views, as in direct distillation.
 
     Args:
         views: to make, in their order.

@@ -6,7 +6,7 @@ import torch
 from model_fixtures import config
 from nerfdiff import memory
 from nerfdiff.errors import ConfigError
-from nerfdiff.memory import PeakMemory, require_memory, training_memory
+from nerfdiff.memory import PeakMemory, is_tight, require_memory, training_memory
 from nerfdiff.model import build_on_meta
 
 
@@ -46,5 +46,7 @@ def test_what_does_not_fit_is_refused_with_what_it_takes(monkeypatch):
     monkeypatch.setattr(memory, "free_memory", lambda device: 10**6)
     with pytest.raises(ConfigError, match=r"training takes about .* cpu has 0\.0 GiB free.*accumulate_grad_batches"):
         require_memory(config(), torch.device("cpu"), 1, 1, 16, 16)
+    assert is_tight(config(), torch.device("cpu"))
     monkeypatch.setattr(memory, "free_memory", lambda device: 10**15)
     require_memory(config(), torch.device("cpu"), 1, 1, 16, 16)
+    assert not is_tight(config(), torch.device("cpu"))

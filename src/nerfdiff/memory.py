@@ -79,7 +79,7 @@ class TrainingMemory:
 def training_memory(
     model_config: Mapping, batch_size: int, target_views: int, height: int, width: int
 ) -> TrainingMemory:
-    """Trace a training step of the joint loss on the meta device (seconds, and no memory, for any size).
+    """Trace a training step of the joint loss on the meta device: it takes time (thousands of operators) and no memory.
 
     Args:
         model_config: arguments of `NerfDiff`.
@@ -104,20 +104,21 @@ def training_memory(
     return TrainingMemory(WEIGHTS_ADAM_EMA * parameters, tracker.peak)
 
 
+def is_tight(model_config: Mapping, device: torch.device) -> bool:
+    """Whether the state alone takes a quarter of what is free, so that a step is worth tracing."""
+    parameters = sum(p.numel() for p in build_on_meta(model_config).parameters())
+    return 4 * WEIGHTS_ADAM_EMA * parameters >= free_memory(device)
+
+
 def require_memory(
     model_config: Mapping, device: torch.device, batch_size: int, target_views: int, height: int, width: int
 ) -> None:
     """Refuse a run that the device cannot hold before hours or the machine are lost to it.
 
-    The step is traced where the state alone takes a quarter of what is free, which is where it matters.
-
     Raises:
         ConfigError: it takes more than is free on `device`; the message says how much, for what, and what takes less.
     """
-    parameters = sum(p.numel() for p in build_on_meta(model_config).parameters())
     free = free_memory(device)
-    if 4 * WEIGHTS_ADAM_EMA * parameters < free:
-        return
     needed = training_memory(model_config, batch_size, target_views, height, width)
     state, step, available = (amount / 2**30 for amount in (needed.state, needed.step, free))
     told = (

@@ -14,7 +14,7 @@ from nerfdiff.callbacks.checkpoint import ClearCheckpointIO
 from nerfdiff.checkpoint import check_resumable, export_model, last_checkpoint, load_model
 from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.errors import CheckpointError, ConfigError
-from nerfdiff.memory import WEIGHTS_ADAM_EMA, require_memory
+from nerfdiff.memory import WEIGHTS_ADAM_EMA, is_tight, require_memory
 from nerfdiff.modules.nerfdiff_module import NerfDiffModule
 
 log = logging.getLogger(__name__)
@@ -70,9 +70,11 @@ def train(cfg: DictConfig) -> dict[str, float]:
 
 
 def _require_memory(model_config: dict, trainer: Trainer, data: SceneDataModule) -> None:
+    device = trainer.strategy.root_device
+    if not is_tight(model_config, device):
+        return
     first = data.reader("train").load(0, [0]).cameras
     batch_size = max(1, data.batch_size // (trainer.world_size * trainer.accumulate_grad_batches))
-    device = trainer.strategy.root_device
     require_memory(model_config, device, batch_size, data.target_views, first.height, first.width)
 
 

@@ -6,7 +6,6 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-import OpenEXR
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
@@ -28,7 +27,6 @@ from abo_fixtures import (
 from nerfdiff.data import item_folders as item_folders_module
 from nerfdiff.data.abo_material_files import read_split
 from nerfdiff.data.abo_materials import ABOMaterials
-from nerfdiff.data.exr import read_exr
 from nerfdiff.data.scene import MissingSplit, SceneReader
 from nerfdiff.errors import ConfigError, DataError
 
@@ -278,42 +276,6 @@ def test_the_fingerprint_follows_the_environment_that_is_read(root):
     (root / "B000/segmentation/segmentation_9.jpg").touch()
     prints += [read(root).fingerprint(), read(root, environment=1).fingerprint()]
     assert len(set(prints)) == 5
-
-
-@pytest.mark.parametrize("half", [False, True])
-def test_exr_files_as_renderers_write_them(tmp_path, half):
-    values = np.random.default_rng(0).uniform(1, 9, (5, 7)).astype(np.float16 if half else np.float32)
-    values[0, 0], values[1, 2] = np.inf, 65504
-    write_exr(tmp_path / "plain.exr", values, half)
-    alpha = np.ones_like(values)
-    for compression in ("ZIP", "PIZ"):
-        header = {"compression": getattr(OpenEXR, f"{compression}_COMPRESSION"), "type": OpenEXR.scanlineimage}
-        for channels in ({"V": values}, {"Z": values, "A": alpha}, {"RGBA": np.stack([values] * 3 + [alpha], -1)}):
-            OpenEXR.File(header, channels).write(str(tmp_path / f"{compression}{''.join(channels)}.exr"))
-    files = list(tmp_path.iterdir())
-    assert len(files) == 7
-    for file in files:
-        assert np.array_equal(read_exr(file, (5, 7)), values.astype(np.float32))
-    with pytest.raises(DataError, match=r"plain\.exr: 5x7 values, but the image has 7x5"):
-        read_exr(tmp_path / "plain.exr", (7, 5))
-
-
-def test_damaged_exr_files_give_one_kind_of_error(tmp_path):
-    write_exr(tmp_path / "a.exr", np.ones((6, 8)))
-    whole = (tmp_path / "a.exr").read_bytes()
-    rng = np.random.default_rng(0)
-    refused = []
-    for trial in range(60):
-        damaged = bytearray(whole[: rng.integers(len(whole))] if trial % 3 == 0 else whole)
-        for position in rng.integers(0, max(len(damaged), 1), 3 * bool(trial % 3)):
-            damaged[position] = rng.integers(256)
-        (tmp_path / "a.exr").write_bytes(damaged)
-        try:
-            assert read_exr(tmp_path / "a.exr", (6, 8)).shape == (6, 8)
-        except DataError as error:
-            refused.append(str(error))
-    assert len(refused) > 30
-    assert all(text.startswith(str(tmp_path / "a.exr")) and "\n" not in text for text in refused)
 
 
 def test_workers_read_depth_after_their_parent_did(root):

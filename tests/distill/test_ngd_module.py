@@ -14,6 +14,7 @@ from nerfdiff.distill.guidance import Guidance
 from nerfdiff.distill.ngd import GuidedViews
 from nerfdiff.distill.sds import DenoisedRenderings
 from nerfdiff.distill.stochastic import AutoregressiveViews
+from nerfdiff.errors import ConfigError
 
 
 def scene() -> ViewBatch:
@@ -76,6 +77,12 @@ def test_every_teacher_fits_the_field_and_leaves_the_model_alone(teacher):
     again = distillation(TEACHERS[teacher]).distil(net, scene(), seed=0)
     assert torch.equal(again.field.planes, module.field.planes)
     assert not torch.equal(distillation(TEACHERS[teacher]).distil(net, scene(), 1).field.planes, module.field.planes)
+
+
+@pytest.mark.parametrize("teacher", [guided(condition="last"), lambda v: DenoisedRenderings(v, 4, 1.0, 0.02, "last")])
+def test_an_unknown_condition_is_refused_with_the_known_ones(teacher):
+    with pytest.raises(ConfigError, match="choose first or current"):
+        distillation(teacher).distil(model().requires_grad_(False), scene(), seed=0)
 
 
 def test_full_guidance_asks_for_what_is_rendered_already():

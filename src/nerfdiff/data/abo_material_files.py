@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.data.json_files import entry, matrix, read_json
+from nerfdiff.data.json_files import entry, matrix, read_list
 from nerfdiff.data.posed_files import read_text
 from nerfdiff.errors import DataError, some
 
@@ -82,9 +82,7 @@ class MaterialViews:
             DataError: the file is missing, damaged or incomplete; the message names the view.
         """
         file = folder / KEY_FILE
-        views = entry(read_json(file, "expected an object with a list 'views'"), "views", list, file)
-        if not views:
-            raise DataError(f"{file}: 'views' is empty; expected one view per image")
+        views = read_list(file, "views", "one view per image")
         parsed = {}
         for k, view in enumerate(views):
             where = f"{file}: views[{k}]"

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerfdiff.data.blender_camera import BlenderCamera
-from nerfdiff.data.json_files import entry, matrix, read_json
+from nerfdiff.data.json_files import entry, matrix, read_list
 from nerfdiff.errors import DataError, some
 
 KEY_FILE = "transforms.json"
@@ -35,9 +35,7 @@ class ItemTransforms:
                 message names the file and the frame.
         """
         file = folder / KEY_FILE
-        frames = entry(read_json(file, "expected an object with a list 'frames'"), "frames", list, file)
-        if not frames:
-            raise DataError(f"{file}: 'frames' is empty; expected one frame per image")
+        frames = read_list(file, "frames", "one frame per image")
         parsed = {}
         for k, frame in enumerate(frames):
             where = f"{file}: frames[{k}]"

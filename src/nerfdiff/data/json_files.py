@@ -28,6 +28,18 @@ def read_json(path: Path, expected: str) -> dict[str, Any]:
     return value
 
 
+def read_list(path: Path, key: str, of: str) -> list[Any]:
+    """The list under `key` of the JSON object in a file, which must not be empty.
+
+    Raises:
+        DataError: as `read_json`, or there is no such list; the message says what it was expected to be `of`.
+    """
+    values = entry(read_json(path, f"expected an object with a list {key!r}"), key, list, path)
+    if not values:
+        raise DataError(f"{path}: {key!r} is empty; expected {of}")
+    return values
+
+
 def entry(values: Any, key: str, kind: type | tuple[type, ...], where: str | Path) -> Any:
     """`values[key]`, which has to be of this type.
 

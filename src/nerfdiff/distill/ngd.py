@@ -2,10 +2,8 @@
 
 from nerfdiff.diffusion.ddim import ddim_step, time_steps
 from nerfdiff.distill.guidance import Guidance
+from nerfdiff.distill.teacher import sees_current
 from nerfdiff.distill.virtual_views import Images, VirtualViews
-from nerfdiff.errors import ConfigError
-
-CONDITIONS = ("first", "current")
 
 
 class GuidedViews:
@@ -32,10 +30,8 @@ class GuidedViews:
         guidance: Guidance,
         condition: str,
     ):
-        if condition not in CONDITIONS:
-            raise ConfigError(f"teacher.condition={condition!r}: choose {' or '.join(CONDITIONS)}")
         self.views, self.steps, self.eta, self.guidance = views, steps, eta, guidance
-        self.on_current = condition == "current"
+        self.on_current = sees_current(condition)
         self.times = time_steps(steps, t_max, t_min, device=views.encoding.source.device)
         self.weight: float | None = None
         self._z, self._last = views.noise(), 2 * views.first_renderings - 1

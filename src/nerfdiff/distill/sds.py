@@ -1,6 +1,7 @@
 """Score distillation: renderings noised at random t and denoised are what the field is fitted to (paper, appendix)."""
 
 from nerfdiff.diffusion.schedule import add_noise, alpha_sigma, expand
+from nerfdiff.distill.teacher import sees_current
 from nerfdiff.distill.virtual_views import Images, VirtualViews
 
 
@@ -12,6 +13,9 @@ class DenoisedRenderings:
         steps: how many times targets are asked for; each costs as many denoiser calls as a step of NGD.
         t_max, t_min: times are uniform between them.
         condition: the rendering that the CDM sees: the `first` or the `current` one.
+
+    Raises:
+        ConfigError: another `condition`.
     """
 
     weight = None
@@ -19,7 +23,7 @@ class DenoisedRenderings:
     def __init__(self, views: VirtualViews, steps: int, t_max: float, t_min: float, condition: str):
         self.views, self.steps = views, steps
         self.t_max, self.t_min = t_max, t_min
-        self.on_current = condition == "current"
+        self.on_current = sees_current(condition)
 
     def targets(self, step: int, rendered: Images) -> Images:
         t = self.t_min + (self.t_max - self.t_min) * self.views.uniform()

@@ -7,6 +7,7 @@ import torch
 from nerfdiff.diffusion.ddim import ddim_step, time_steps
 from nerfdiff.diffusion.denoiser import Condition
 from nerfdiff.distill.virtual_views import Images, VirtualViews
+from nerfdiff.field.encoder import Encoding
 from nerfdiff.randomness import generator
 
 
@@ -30,33 +31,32 @@ class AutoregressiveViews:
     @torch.no_grad()
     def __init__(self, views: VirtualViews, steps: int, sampler_steps: int, t_max: float, t_min: float, eta: float):
         self.steps = steps
-        self._views, model, encoding = views, views.model, views.encoding
-        frustum = encoding.triplane
-        self._encodings = [encoding]
+        model, encodings = views.model, [views.encoding]
+        frustum = views.encoding.triplane
         choice = generator("cpu", *views.seed, "stochastic conditioning")
-        times = time_steps(sampler_steps, t_max, t_min, device=encoding.source.device)
+        times = time_steps(sampler_steps, t_max, t_min, device=views.encoding.source.device)
         images = []
         for view in range(len(views)):
             conditions: dict[int, Condition] = {}
             z = views.noise_of(view)[None]
             for t, t_next in pairwise(times):
-                known = int(torch.randint(len(self._encodings), (), generator=choice))
+                known = int(torch.randint(len(encodings), (), generator=choice))
                 if known not in conditions:
-                    conditions[known] = self._condition(known, view)
+                    conditions[known] = _condition(views, encodings[known], known, view)
                 x0 = model.denoiser(z, t[None], conditions[known])
                 views.denoiser_calls += 1
                 z = ddim_step(z, x0, t, t_next, eta, views.noise_of(view)[None] if eta > 0 else None)
             images.append((0.5 * (x0 + 1)).clamp(0, 1))
-            self._encodings.append(model.encode(images[-1], frustum.cameras, frustum.near, frustum.far))
+            encodings.append(model.encode(images[-1], frustum.cameras, frustum.near, frustum.far))
         self.images = torch.cat(images)
 
     def targets(self, step: int, rendered: Images) -> Images:
         return self.images
 
-    def _condition(self, known: int, view: int) -> Condition:
-        """View `view` as seen from what is known: 0 is the input image, k + 1 is view k."""
-        cameras, model, encoding = self._views.cameras, self._views.model, self._encodings[known]
-        wanted = cameras[:, view : view + 1]
-        if known > 0:
-            wanted = wanted.relative_to(cameras[:, known - 1 : known])
-        return model.condition(encoding, wanted, model.render(encoding, wanted))
+
+def _condition(views: VirtualViews, encoding: Encoding, known: int, view: int) -> Condition:
+    """View `view` as seen from what is known: 0 is the input image, k + 1 is view k; `encoding` is its."""
+    wanted = views.cameras[:, view : view + 1]
+    if known > 0:
+        wanted = wanted.relative_to(views.cameras[:, known - 1 : known])
+    return views.model.condition(encoding, wanted, views.model.render(encoding, wanted))

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 from nerfdiff.distill.virtual_views import Images, VirtualViews
+from nerfdiff.errors import ConfigError
 
 
 @runtime_checkable
@@ -26,3 +27,14 @@ class Teacher(Protocol):
 
 
 MakeTeacher = Callable[[VirtualViews], Teacher]
+
+
+def sees_current(condition: str) -> bool:
+    """Whether the CDM is conditioned on the field's `current` rendering, rather than on the `first`.
+
+    Raises:
+        ConfigError: neither of them.
+    """
+    if condition not in ("first", "current"):
+        raise ConfigError(f"teacher.condition={condition!r}: choose first or current")
+    return condition == "current"

@@ -8,7 +8,7 @@ from nerfdiff.cli import entry_point
 @entry_point("evaluate")
 def main(cfg: DictConfig) -> float | None:
     """Returns the strategy's PSNR, which a sweep may optimise."""
-    from nerfdiff.evaluation import evaluate  # slow to import: not for --cfg
+    from nerfdiff.evaluation.evaluate import evaluate  # slow to import: not for --cfg
 
     return evaluate(cfg)[0].psnr
 

@@ -7,7 +7,7 @@ from nerfdiff.checkpoint import export, load_model
 from nerfdiff.cli import load_config
 from nerfdiff.distill.none import SingleImageNeRF
 from nerfdiff.errors import CheckpointError, ConfigError, DataError
-from nerfdiff.evaluation import evaluate
+from nerfdiff.evaluation.evaluate import evaluate
 from nerfdiff.metrics.predictions import NonFinitePrediction
 from nerfdiff.results.row import read_rows
 from training_fixtures import run_training, write_dataset

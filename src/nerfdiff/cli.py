@@ -10,9 +10,11 @@ from pathlib import Path
 import hydra
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, ValueType
-from hydra.errors import HydraException, InstantiationException, MissingConfigException
+from hydra.errors import CompactHydraException, HydraException, InstantiationException, MissingConfigException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
@@ -29,7 +31,7 @@ KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
     list: ("a list", (list,)),
     DictConfig: ("a mapping", (dict,)),
 }
-OPTIONAL_GROUPS = ("logger", "experiment")
+OPTIONAL_GROUPS = ("logger", "experiment", "sweep")
 
 
 def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], object]], Callable[[], None]]:
@@ -49,6 +51,9 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], object]], 
                 message = explain(error)
                 if message is None or os.environ.get("HYDRA_FULL_ERROR") == "1":
                     raise
+                if HydraConfig.get().mode == RunMode.MULTIRUN:
+                    # an exit would end the jobs still to come; this Hydra keeps for the end, and prints as one line
+                    raise CompactHydraException(f"error: {message}") from error
                 sys.exit(f"error: {message}")
 
         command = hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(run)

@@ -89,3 +89,15 @@ def test_no_guidance_makes_numbers_that_are_none(gamma, t_min):
     for compare in ("current", "last"):
         history, *_ = run(Guidance("snr", gamma, compare), std=0.1, steps=16, t_min=t_min)
         assert all(torch.isfinite(field).all() for field in history)
+
+
+def test_begun_at_less_than_one_the_views_are_the_noised_renderings():
+    """Algorithm 1's first line: Z = α I_θ + σ ε. A denoiser that knows no better gives the renderings back."""
+    start = torch.full(SHAPE, 0.4)
+    views = GaussianViews(start.expand(K, *SHAPE), 1e4, start)
+    views.denoise = lambda z, t, rendered=None: (
+        (z - expand(alpha_sigma(t)[1], z) * views.fixed_noise) / expand(alpha_sigma(t)[0], z)
+    )
+    teacher = GuidedViews(views, 4, 0.6, 0.0, 0.0, Guidance("constant", 0.0, "current"), "first")
+    targets = teacher.targets(0, torch.zeros(K, *SHAPE))
+    torch.testing.assert_close(2 * targets - 1, start.expand(K, *SHAPE), atol=1e-5, rtol=0)

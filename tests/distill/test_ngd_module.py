@@ -15,6 +15,7 @@ from nerfdiff.distill.ngd import GuidedViews
 from nerfdiff.distill.sds import DenoisedRenderings
 from nerfdiff.distill.stochastic import AutoregressiveViews
 from nerfdiff.errors import ConfigError
+from nerfdiff.modules.ngd_module import NGDModule
 
 
 def scene() -> ViewBatch:
@@ -59,8 +60,9 @@ TEACHERS = {
 }
 
 
-def distillation(teacher, views=3, inner_steps=3, rays=64, lr_planes=1e-2) -> Distillation:
-    return Distillation("test", prior(views), teacher, inner_steps, rays, lr_planes, 1e-4, views_at_once=2)
+def distillation(teacher, views=3, inner_steps=3, rays=64, lr_planes=1e-2, **more) -> Distillation:
+    options = {"lr_decoder": 1e-4, "lr_decay": "none", "fit_source": False, "views_at_once": 2} | more
+    return Distillation("test", prior(views), teacher, inner_steps, rays, lr_planes, **options)
 
 
 @pytest.mark.parametrize("teacher", TEACHERS)
@@ -83,6 +85,38 @@ def test_every_teacher_fits_the_field_and_leaves_the_model_alone(teacher):
 def test_an_unknown_condition_is_refused_with_the_known_ones(teacher):
     with pytest.raises(ConfigError, match="choose first or current"):
         distillation(teacher).distil(model().requires_grad_(False), scene(), seed=0)
+
+
+@pytest.mark.parametrize(("decay", "factors"), [("none", [1, 1, 1, 1]), ("linear", [1, 0.75, 0.5, 0.25])])
+def test_learning_rates_fall_with_the_steps(decay, factors, monkeypatch):
+    rates = []
+    fit = NGDModule._fit
+
+    def watched(self, targets):
+        rates.append([group["lr"] for group in self.optimizers().param_groups])
+        return fit(self, targets)
+
+    monkeypatch.setattr(NGDModule, "_fit", watched)
+    distillation(TEACHERS["ngd"], lr_decay=decay).distil(model().requires_grad_(False), scene(), seed=0)
+    assert rates == [pytest.approx([1e-2 * factor, 1e-4 * factor]) for factor in factors]
+
+
+def test_an_unknown_decay_is_refused_with_the_known_ones():
+    with pytest.raises(ConfigError, match="none, linear, cosine"):
+        distillation(TEACHERS["ngd"], lr_decay="slow").distil(model().requires_grad_(False), scene(), seed=0)
+
+
+def test_the_input_image_is_fitted_where_asked():
+    """Views that ask for nothing (full guidance) leave the input image alone to be fitted."""
+    net = model().requires_grad_(False)
+
+    def error(fit_source):
+        module = distillation(guided(1.0, "constant"), inner_steps=60, fit_source=fit_source).distil(net, scene(), 0)
+        with torch.no_grad():
+            image = module.field.render(net.renderer, module.field.cameras[None]).rgb[0, 0].movedim(-1, 0)
+        return float((image - scene().source[0]).square().mean())
+
+    assert error(True) < 0.8 * error(False)
 
 
 def test_full_guidance_asks_for_what_is_rendered_already():

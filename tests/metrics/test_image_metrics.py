@@ -3,7 +3,7 @@ import math
 import numpy as np
 import torch
 
-from nerfdiff.metrics.image import dequantise, psnr, quantise, ssim, ssim_gaussian
+from nerfdiff.metrics.image import dequantise, gradient_energy, psnr, quantise, sharpness, ssim, ssim_gaussian
 
 
 def picture_pair(n=2, size=16, seed=0):
@@ -91,3 +91,33 @@ def test_blank_images_have_finite_scores():
         assert metric(white, white).isfinite().all() and metric(grey, white).isfinite().all()
     assert ssim(white, white).item() == 1
     assert ssim_gaussian(white, white).item() == 1
+
+
+def test_gradient_energy_is_that_of_a_naive_loop():
+    images, _ = picture_pair(size=6)
+    for image, measured in zip(images.double(), gradient_energy(images).tolist(), strict=True):
+        across = sum(float((image[:, y, x + 1] - image[:, y, x]).square().sum()) for y in range(6) for x in range(5))
+        down = sum(float((image[:, y + 1, x] - image[:, y, x]).square().sum()) for y in range(5) for x in range(6))
+        assert math.isclose(measured, across + down, rel_tol=1e-9)
+
+
+def test_sharpness_falls_with_blur_and_rises_with_noise():
+    noisy, picture = picture_pair()
+    blurred = torch.nn.functional.avg_pool2d(picture, 3, stride=1, padding=1, count_include_pad=False)
+    assert all(value < 0.9 for value in sharpness(blurred, picture))
+    assert all(value > 1.5 for value in sharpness(noisy, picture))
+    assert sharpness(picture, picture) == [1, 1]
+
+
+def test_sharpness_is_the_square_of_contrast_and_each_image_has_its_own():
+    _, picture = picture_pair(n=3)
+    contrast = torch.tensor([1.0, 0.5, 0.0])[:, None, None, None]
+    faded = 0.5 + contrast * (picture - 0.5)
+    np.testing.assert_allclose(sharpness(faded, picture), [1, 0.25, 0], atol=1e-6)
+
+
+def test_sharpness_of_a_flat_truth_is_not_measured():
+    noisy, picture = picture_pair()
+    white = torch.ones_like(picture)
+    assert sharpness(noisy, white) == [None, None]
+    assert sharpness(white, picture) == [0, 0]

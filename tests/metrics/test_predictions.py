@@ -112,5 +112,5 @@ def test_damaged_files_are_named(tmp_path):
     with pytest.raises(DataError, match=r"scene\.json"):
         read_prediction(tmp_path / "none", "a")
     (folder / "scene.json").write_text(json.dumps({"format": 99}))
-    with pytest.raises(DataError, match="format 99, expected 1"):
+    with pytest.raises(DataError, match="format 99, expected 2"):
         read_prediction(tmp_path / "none", "a")

@@ -59,7 +59,8 @@ def grey(*levels):
 
 
 def config(**changes):
-    return OmegaConf.merge(OmegaConf.load(CONFIG), {"lpips": False, "st_lpips": False, "fid": False}, changes)
+    without = {"lpips": False, "st_lpips": False, "fid": False, "consistency": {"background": 1.0}}
+    return OmegaConf.merge(OmegaConf.load(CONFIG), without, changes)
 
 
 def scorer(**changes):
@@ -115,7 +116,9 @@ def test_known_numbers(three_scenes):
 def test_what_is_not_measured_is_empty(three_scenes):
     tmp_path, reader = three_scenes
     summary = scorer().score(tmp_path / "predictions" / "none", truth_from(reader), tmp_path / "scores")
-    for metric in ("lpips", "lpips_net", "st_lpips_vgg", "fid", "fd_st_vgg", "fid_n", "depth_rmse", "mask_iou"):
+    networks = ("lpips", "lpips_net", "st_lpips_vgg", "fid", "fd_st_vgg", "fid_n")
+    whole = ("floaters", "depth_extent", "consistency_psnr", "consistency_psnr_truth", "consistency_n")
+    for metric in (*networks, "sharpness", "depth_rmse", "mask_iou", *whole):
         assert summary[metric] is None
     for row in rows(tmp_path / "scores" / "per_image.csv"):
         assert row["lpips"] == row["st_lpips_vgg"] == row["depth_rmse"] == row["ssim_gaussian"] == ""

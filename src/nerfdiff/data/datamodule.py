@@ -202,8 +202,11 @@ class SceneDataModule(LightningDataModule):
     def test_dataloader(self) -> DataLoader:
         """Each rank tests its own share of the scenes."""
         rank, world_size = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
-        share = range(rank, len(self.test_set), world_size)
-        return DataLoader(self.test_set, sampler=share, num_workers=self.num_workers, **_common_options())
+        return self.scenes(range(rank, len(self.test_set), world_size))
+
+    def scenes(self, positions: Sequence[int]) -> DataLoader:
+        """Batches of one test scene each, of these positions in the test set."""
+        return DataLoader(self.test_set, sampler=positions, num_workers=self.num_workers, **_common_options())
 
     def _validation_scenes(self) -> EvaluationScenes:
         reader = self.reader("val")

@@ -1,10 +1,12 @@
 """Two honest baselines that know nothing of 3D: any method worth running beats both."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
+from lightning import Callback
 from torch import Tensor
 
 from nerfdiff.data.batch import ViewBatch
@@ -20,7 +22,7 @@ class CopyInput:
 
     name: str = "copy_input"
 
-    def predict(self, model: NerfDiff | None, scene: ViewBatch, seed: int) -> Views:
+    def predict(self, model: NerfDiff | None, scene: ViewBatch, seed: int, callbacks: Sequence[Callback] = ()) -> Views:
         return Views(scene.source.expand(scene.targets.shape[1], -1, -1, -1))
 
 
@@ -31,7 +33,7 @@ class MeanImage:
     mean: Float[Tensor, "3 height width"]
     name: str = "mean_image"
 
-    def predict(self, model: NerfDiff | None, scene: ViewBatch, seed: int) -> Views:
+    def predict(self, model: NerfDiff | None, scene: ViewBatch, seed: int, callbacks: Sequence[Callback] = ()) -> Views:
         mean = F.interpolate(self.mean[None], scene.targets.shape[-2:], mode="area")
         return Views(mean.expand(scene.targets.shape[1], -1, -1, -1).to(scene.source))
 

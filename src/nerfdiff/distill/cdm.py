@@ -1,9 +1,11 @@
 """Strategy `cdm`: every view sampled from the CDM by itself ("Ours (CDM)" in the paper's figures)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
+from lightning import Callback
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras
@@ -45,7 +47,7 @@ class IndependentViews:
     views_at_once: int
 
     @torch.no_grad()
-    def predict(self, model: NerfDiff, scene: ViewBatch, seed: int) -> Views:
+    def predict(self, model: NerfDiff, scene: ViewBatch, seed: int, callbacks: Sequence[Callback] = ()) -> Views:
         encoding = model.encode(scene.source, scene.source_cameras, scene.near, scene.far)
         images = self.sample(model, encoding, scene.target_cameras, (seed, "cdm", *scene.scene_ids))[0]
         return Views(

@@ -14,7 +14,7 @@ class SampledViews:
         eta: DDIM's η.
     """
 
-    weight = None
+    t = weight = None
 
     def __init__(self, views: VirtualViews, steps: int, sampler_steps: int, t_max: float, t_min: float, eta: float):
         self.steps = steps

@@ -1,12 +1,14 @@
 """A field fine-tuned for one scene at test time, by any teacher, then rendered: strategies `ngd`, `direct`, `sds`."""
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from lightning import Trainer
+from lightning import Callback, Trainer
 
 from nerfdiff.data.batch import ViewBatch
+from nerfdiff.distill.field_file import SavedField
 from nerfdiff.distill.priors.prior import Prior
 from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.distill.strategy import Views
@@ -29,6 +31,8 @@ class Distillation:
         inner_steps: N.
         rays: B.
         lr_planes, lr_decoder: learning rates of W and θ.
+        lr_decay: of both, as the steps go by: `none`, `linear` or `cosine`.
+        fit_source: whether the input image is fitted beside the virtual views.
         views_at_once: views denoised in one batch, which bounds memory.
     """
 
@@ -39,10 +43,12 @@ class Distillation:
     rays: int
     lr_planes: float
     lr_decoder: float
+    lr_decay: str
+    fit_source: bool
     views_at_once: int
 
-    def predict(self, model: NerfDiff, scene: ViewBatch, seed: int) -> Views:
-        module = self.distil(model, scene, seed)
+    def predict(self, model: NerfDiff, scene: ViewBatch, seed: int, callbacks: Sequence[Callback] = ()) -> Views:
+        module = self.distil(model, scene, seed, callbacks)
         with torch.no_grad():
             rendering = module.field.render(model.renderer, scene.target_cameras)
         samples = model.renderer.samples_per_ray
@@ -54,10 +60,17 @@ class Distillation:
             depth=z_depth(rendering.depth[0], scene.target_cameras[0]),
             denoiser_calls=module.views.denoiser_calls,
             field_queries=samples * (fitted + watched + rendering.opacity.numel()),
+            field=SavedField(module.field, model.renderer),
+            trace=module.trace,
+            status=module.status,
         )
 
-    def distil(self, model: NerfDiff, scene: ViewBatch, seed: int) -> NGDModule:
-        """The fine-tuned field of a batch of one scene, with its trace and status."""
+    def distil(self, model: NerfDiff, scene: ViewBatch, seed: int, callbacks: Sequence[Callback] = ()) -> NGDModule:
+        """The fine-tuned field of a batch of one scene, with its trace and status.
+
+        Args:
+            callbacks: of the Trainer that fits it.
+        """
         purpose = (seed, "distil", *scene.scene_ids)
         with torch.no_grad():
             encoding = model.encode(scene.source, scene.source_cameras, scene.near, scene.far)
@@ -70,6 +83,8 @@ class Distillation:
             self.rays,
             self.lr_planes,
             self.lr_decoder,
+            self.lr_decay,
+            self.fit_source,
             purpose,
         )
         device = scene.source.device
@@ -80,6 +95,7 @@ class Distillation:
             accelerator="cuda" if device.type == "cuda" else "cpu",
             devices=[device.index or 0] if device.type == "cuda" else 1,
             logger=False,
+            callbacks=list(callbacks),
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,

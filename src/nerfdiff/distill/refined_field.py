@@ -1,10 +1,8 @@
 """The field that is fine-tuned at test time: triplane and decoder as parameters, in the input camera's space."""
 
 import copy
-from dataclasses import replace
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfdiff.cameras import Cameras
@@ -24,20 +22,20 @@ class RefinedField(nn.Module):
     def __init__(self, triplane: Triplane, decoder: Decoder):
         super().__init__()
         self.planes = nn.Parameter(triplane.planes.detach().float().clone())
-        self.decoder = copy.deepcopy(decoder).float().requires_grad_(True)
-        self._frustum = triplane  # for its cameras and bounds
+        self.decoder = copy.deepcopy(decoder).float().requires_grad_(True).train()
+        self._size = triplane.cameras.height, triplane.cameras.width
+        # the frustum moves with the module, and is no part of what is fitted
+        for name, value in (("K", triplane.cameras.K), ("near", triplane.near), ("far", triplane.far)):
+            self.register_buffer(name, value.clone(), persistent=False)
 
     @property
-    def near(self) -> Float[Tensor, "1"]:
-        return self._frustum.near
-
-    @property
-    def far(self) -> Float[Tensor, "1"]:
-        return self._frustum.far
+    def cameras(self) -> Cameras:
+        """The input camera [1], in whose space points are given."""
+        return Cameras(torch.eye(4, device=self.K.device)[None], self.K, *self._size)
 
     def field(self) -> TriplaneField:
         """Colour and density of points in the input camera's space."""
-        return TriplaneField(replace(self._frustum, planes=self.planes), self.decoder)
+        return TriplaneField(Triplane(self.planes, self.cameras, self.near, self.far), self.decoder)
 
     def render(self, renderer: Renderer, cameras: Cameras) -> Rendering:
         """Whole images of cameras [1, views]: leading shape [1, views, height, width]."""

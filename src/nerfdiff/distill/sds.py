@@ -18,7 +18,7 @@ class DenoisedRenderings:
         ConfigError: another `condition`.
     """
 
-    weight = None
+    t = weight = None
 
     def __init__(self, views: VirtualViews, steps: int, t_max: float, t_min: float, condition: str):
         self.views, self.steps = views, steps

@@ -26,7 +26,7 @@ class AutoregressiveViews:
         eta: DDIM's η.
     """
 
-    weight = None
+    t = weight = None
 
     @torch.no_grad()
     def __init__(self, views: VirtualViews, steps: int, sampler_steps: int, t_max: float, t_min: float, eta: float):

@@ -14,6 +14,9 @@ class Teacher(Protocol):
     steps: int
     """How many times targets are asked for."""
 
+    t: float | None
+    """Time of the last step, where all views share one."""
+
     weight: float | None
     """Of guidance at the last step, where there is one."""
 

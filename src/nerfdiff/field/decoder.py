@@ -25,6 +25,16 @@ class Decoder(nn.Module):
         self.density_shift = density_shift
         self.density_scale = density_scale
 
+    @property
+    def settings(self) -> dict[str, int | float]:
+        """The arguments that make another one of this shape."""
+        return {
+            "channels": self.hidden.in_features,
+            "hidden": self.hidden.out_features,
+            "density_shift": self.density_shift,
+            "density_scale": self.density_scale,
+        }
+
     def forward(
         self, features: Float[Tensor, "*points channels"]
     ) -> tuple[Float[Tensor, "*points 3"], Float[Tensor, "*points"]]:

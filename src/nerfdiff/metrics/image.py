@@ -1,4 +1,4 @@
-"""Per-image fidelity: PSNR and SSIM, each by the definition its column is published under."""
+"""Per-image fidelity: PSNR and SSIM, each by the definition its column is published under, and sharpness."""
 
 import torch
 from jaxtyping import Float, Float64, UInt8
@@ -54,3 +54,15 @@ def ssim_gaussian(predictions: Float[Tensor, "n 3 h w"], truth: Float[Tensor, "n
         predictions, truth, sigma=1.5, data_range=1.0, reduction="none", return_full_image=True
     )
     return full[..., border:-border, border:-border].mean(dim=(1, 2, 3)).cpu()
+
+
+def gradient_energy(images: Float[Tensor, "n 3 h w"]) -> Float64[Tensor, "n"]:
+    """Sum of the squared differences of neighbouring pixels of each image: along rows and columns, over colours."""
+    images = images.double()
+    return sum(images.diff(dim=axis).square().sum(dim=(1, 2, 3)) for axis in (-2, -1))
+
+
+def sharpness(predictions: Float[Tensor, "n 3 h w"], truth: Float[Tensor, "n 3 h w"]) -> list[float | None]:
+    """Gradient energy of each image over that of its truth: under 1 is blurred, over 1 noisy; None of a flat truth."""
+    energies = zip(gradient_energy(predictions).tolist(), gradient_energy(truth).tolist(), strict=True)
+    return [predicted / true if true > 0 else None for predicted, true in energies]

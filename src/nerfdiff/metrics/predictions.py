@@ -4,6 +4,7 @@
     <root>/<strategy>/<scene>/scene.json      views, source views, cost; there only if the scene is complete
                               rgb/<view>.png  8 bit, rounded
                               depth/<view>.npz  depth along z and opacity, float32, where a strategy has them
+                              field.safetensors, trace.csv, trace.png, orbit.mp4, where they are asked for
 
 A scene's folder appears under its name only when it is complete, so an interrupted evaluation goes on with
 the next scene.
@@ -12,7 +13,7 @@ the next scene.
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from nerfdiff.errors import DataError
 from nerfdiff.metrics.image import quantise
 from nerfdiff.results.files import write_text
 
-FORMAT = 1
+FORMAT = 2
 PLAN = "plan.json"
 SCENE = "scene.json"
 AGAIN = "delete the folder of its scene and evaluate again"
@@ -45,6 +46,7 @@ class Prediction:
         views: names of the predicted views, in the order of `pixels`.
         source_views: names of the views the model was given.
         cost: what the writer measured (seconds, counts).
+        status: `ok`, or why the method fell back to something else.
     """
 
     scene_id: str
@@ -54,6 +56,7 @@ class Prediction:
     depth: Float[Tensor, "views h w"] | None
     opacity: Float[Tensor, "views h w"] | None
     cost: dict[str, float]
+    status: str
 
 
 class PredictionWriter:
@@ -108,6 +111,8 @@ class PredictionWriter:
         depth: Float[Tensor, "views h w"] | None = None,
         opacity: Float[Tensor, "views h w"] | None = None,
         cost: Mapping[str, float] | None = None,
+        status: str = "ok",
+        beside: Callable[[Path], object] | None = None,
     ) -> Path:
         """Save one scene, whole or not at all.
 
@@ -115,6 +120,8 @@ class PredictionWriter:
             images: colours, clamped to [0, 1] and rounded to 8 bit here.
             depth: along z in scene units (see `depth.z_depth`); needs `opacity`.
             cost: seconds and counts of this scene, so that a resumed evaluation still knows them.
+            status: `ok`, or why the method fell back to something else.
+            beside: writes further files into the scene's folder, which appears only when they are there too.
 
         Raises:
             NonFinitePrediction: an image has NaN or infinite values.
@@ -135,6 +142,7 @@ class PredictionWriter:
             "source_views": list(source_views),
             "depth": depth is not None,
             "cost": dict(cost or {}),
+            "status": status,
         }
         final, partial = self.folder / scene_id, self.folder / f".{scene_id}.{os.getpid()}.tmp"
         try:
@@ -146,6 +154,8 @@ class PredictionWriter:
                 (partial / "depth").mkdir()
                 for view, d, o in zip(views, depth.float().cpu(), opacity.float().cpu(), strict=True):
                     np.savez_compressed(partial / "depth" / f"{view}.npz", depth=d.numpy(), opacity=o.numpy())
+            if beside is not None:
+                beside(partial)
             (partial / SCENE).write_text(json.dumps(facts, indent=1) + "\n")
             if final.exists():
                 shutil.rmtree(final)
@@ -185,7 +195,9 @@ def read_prediction(folder: Path, scene_id: str) -> Prediction:
     if facts["depth"]:
         arrays = [_read_npz(scene / "depth" / f"{view}.npz") for view in views]
         depth, opacity = (torch.stack(values) for values in zip(*arrays, strict=True))
-    return Prediction(scene_id, views, tuple(facts["source_views"]), pixels, depth, opacity, facts["cost"])
+    return Prediction(
+        scene_id, views, tuple(facts["source_views"]), pixels, depth, opacity, facts["cost"], facts["status"]
+    )
 
 
 def _name(text: str) -> str:

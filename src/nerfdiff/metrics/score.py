@@ -6,18 +6,21 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from rich.progress import track
 from torch import Tensor
 
 from nerfdiff.data.scene import Scene, SceneReader
+from nerfdiff.distill.field_file import FIELD
 from nerfdiff.errors import DataError
 from nerfdiff.metrics import depth as depth_metrics
 from nerfdiff.metrics import image as image_metrics
+from nerfdiff.metrics.consistency import Consistency
 from nerfdiff.metrics.perceptual import LPIPS, LPIPS_NET, LPIPS_VGG, STLPIPS
 from nerfdiff.metrics.predictions import SCENE, Prediction, read_plan, read_prediction
 from nerfdiff.metrics.sets import FrechetDistance, InceptionFeatures, inception_weights
-from nerfdiff.metrics.summary import IMAGE_METRICS, SceneScores, Value, summarise, write_csv
+from nerfdiff.metrics.summary import IMAGE_METRICS, SCENE_METRICS, SceneScores, Value, summarise, write_csv
+from nerfdiff.metrics.whole_scene import Geometry, WholeScene
 from nerfdiff.results.files import write_text
 from nerfdiff.results.row import encode
 
@@ -60,6 +63,8 @@ class Scorer:
         opacity_threshold: above it a pixel counts as hit.
         min_size: images smaller than this many pixels are enlarged for the two LPIPS networks.
         batch: images per pass through a network.
+        geometry: how floaters and depth extent are measured.
+        consistency: how the agreement of views is measured.
 
     Raises:
         DataError: a weights file is damaged.
@@ -77,9 +82,12 @@ class Scorer:
         opacity_threshold: float,
         min_size: int,
         batch: int,
+        geometry: Geometry,
+        consistency: Consistency,
     ):
         self.psnr_floor, self.ssim_gaussian, self.st_lpips = psnr_floor, ssim_gaussian, st_lpips
         self.opacity_threshold, self.min_size, self.batch = opacity_threshold, min_size, batch
+        self.whole_scene = WholeScene(geometry, consistency, opacity_threshold)
         self.lpips_weights = LPIPS_VGG.find(lpips_weights) if lpips else None
         self.fid_weights = inception_weights(fid_weights) if fid else None
 
@@ -110,8 +118,8 @@ class Scorer:
         session = _Session(self, torch.device(device))
         quiet = not sys.stderr.isatty()
         scenes = [
-            session.scene(read_prediction(folder, scene), truth)
-            for scene in track(planned, f"scoring {folder.name}", disable=quiet)
+            session.scene(number, folder, scene, truth)
+            for number, scene in enumerate(track(planned, f"scoring {folder.name}", disable=quiet))
         ]
         summary = summarise(scenes) | session.sets()
         summary["ssim_impl"] = image_metrics.SSIM_IMPL
@@ -119,7 +127,8 @@ class Scorer:
         rows = [row for scene in scenes for row in scene.image_rows()]
         write_csv(out / "per_image.csv", ("scene", "view", *IMAGE_METRICS), rows)
         per_scene = [scene.row() for scene in scenes]
-        write_csv(out / "per_scene.csv", ("scene", "views", "blank", *IMAGE_METRICS), per_scene)
+        columns = ("scene", "views", "status", "blank", *IMAGE_METRICS, *SCENE_METRICS)
+        write_csv(out / "per_scene.csv", columns, per_scene)
         write_text(out / "summary.json", json.dumps(encode(summary), indent=1, allow_nan=False) + "\n")
         return summary
 
@@ -128,14 +137,15 @@ class _Session:
     """Networks on a device, and the statistics of one pass over the scenes."""
 
     def __init__(self, scorer: Scorer, device: torch.device):
-        self.scorer = scorer
+        self.scorer, self.device = scorer, device
         self.lpips = LPIPS(scorer.lpips_weights, device, scorer.min_size) if scorer.lpips_weights else None
         self.st_lpips = STLPIPS(device, scorer.min_size) if scorer.st_lpips else None
         self.inception = InceptionFeatures(scorer.fid_weights, device) if scorer.fid_weights else None
         self.fid, self.fd_st_vgg = FrechetDistance(), FrechetDistance()
         self.images = 0
 
-    def scene(self, prediction: Prediction, truth: Truth) -> SceneScores:
+    def scene(self, number: int, folder: Path, scene_id: str, truth: Truth) -> SceneScores:
+        prediction = read_prediction(folder, scene_id)
         scene = truth(prediction.scene_id, prediction.views)
         if scene.views != prediction.views or scene.pixels.shape != prediction.pixels.shape:
             raise DataError(
@@ -148,26 +158,38 @@ class _Session:
             prediction.pixels.split(self.scorer.batch), scene.pixels.split(self.scorer.batch), strict=True
         ):
             for metric, measured in self._batch(pixels, true_pixels).items():
-                values.setdefault(metric, []).extend(measured.tolist())
+                values.setdefault(metric, []).extend(measured)
         self.images += len(prediction.views)
         blank = bool((scene.pixels == 255).all())
         values |= self._geometry(prediction, scene)
-        return SceneScores(prediction.scene_id, prediction.views, blank, values)
+        whole = {}
+        if prediction.source_views:  # whose camera's space all geometry is in
+            whole = self.scorer.whole_scene.measure(
+                number,
+                prediction,
+                scene,
+                truth(scene_id, prediction.source_views[:1]),
+                folder / scene_id / FIELD,
+                self.device,
+            )
+        return SceneScores(scene_id, prediction.views, blank, values, whole, prediction.status)
 
     def _batch(
         self, pixels: UInt8[Tensor, "n 3 h w"], true_pixels: UInt8[Tensor, "n 3 h w"]
-    ) -> dict[str, Float[Tensor, "n"]]:
+    ) -> dict[str, list[float | None]]:
         pair = image_metrics.dequantise(pixels), image_metrics.dequantise(true_pixels)
         values = {
-            "psnr": image_metrics.psnr(*pair, floor=self.scorer.psnr_floor),
-            "ssim": image_metrics.ssim(*pair),
+            "psnr": image_metrics.psnr(*pair, floor=self.scorer.psnr_floor).tolist(),
+            "ssim": image_metrics.ssim(*pair).tolist(),
+            "sharpness": image_metrics.sharpness(*pair),
         }
         if self.scorer.ssim_gaussian:
-            values["ssim_gaussian"] = image_metrics.ssim_gaussian(*pair)
+            values["ssim_gaussian"] = image_metrics.ssim_gaussian(*pair).tolist()
         if self.lpips:
-            values["lpips"] = self.lpips(*pair)
+            values["lpips"] = self.lpips(*pair).tolist()
         if self.st_lpips:
-            values["st_lpips_vgg"], *features = self.st_lpips(*pair)
+            distances, *features = self.st_lpips(*pair)
+            values["st_lpips_vgg"] = distances.tolist()
             self.fd_st_vgg.update(*features)
         if self.inception:
             self.fid.update(self.inception(pixels), self.inception(true_pixels))

@@ -1,9 +1,9 @@
-"""From per-image numbers to one number: mean over a scene's images, then mean over scenes."""
+"""From numbers of images and scenes to one number: mean over a scene's images, then mean over scenes."""
 
 import csv
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
 
@@ -15,30 +15,36 @@ IMAGE_METRICS = (
     "ssim_gaussian",
     "lpips",
     "st_lpips_vgg",
+    "sharpness",
     "depth_abs_rel",
     "depth_rmse",
     "mask_iou",
 )
+SCENE_METRICS = ("floaters", "depth_extent", "consistency_psnr", "consistency_psnr_truth")
 
 Value = float | int | str | None
 
 
 @dataclass(frozen=True)
 class SceneScores:
-    """Per-image numbers of one scene.
+    """Numbers of one scene.
 
     Args:
         blank: all target images are white, so there is nothing to predict.
         values: for each of `IMAGE_METRICS` that was measured, one value (or None) per view.
+        whole: those of `SCENE_METRICS` that were measured.
+        status: `ok`, or why the method fell back to something else.
     """
 
     scene_id: str
     views: tuple[str, ...]
     blank: bool
     values: Mapping[str, Sequence[float | None]]
+    whole: Mapping[str, float | None] = field(default_factory=dict)
+    status: str = "ok"
 
     def mean(self, metric: str) -> float | None:
-        return _mean(self.values.get(metric, ()))
+        return self.whole.get(metric) if metric in SCENE_METRICS else _mean(self.values.get(metric, ()))
 
     def image_rows(self) -> list[dict[str, Value]]:
         rows = []
@@ -48,8 +54,9 @@ class SceneScores:
         return rows
 
     def row(self) -> dict[str, Value]:
-        means = {m: self.mean(m) for m in IMAGE_METRICS}
-        return {"scene": self.scene_id, "views": len(self.views), "blank": int(self.blank)} | means
+        means = {m: self.mean(m) for m in (*IMAGE_METRICS, *SCENE_METRICS)}
+        facts = {"scene": self.scene_id, "views": len(self.views), "status": self.status, "blank": int(self.blank)}
+        return facts | means
 
 
 def summarise(scenes: Sequence[SceneScores]) -> dict[str, Value]:
@@ -62,7 +69,8 @@ def summarise(scenes: Sequence[SceneScores]) -> dict[str, Value]:
         "n_views": sum(len(scene.views) for scene in scenes),
         "blank_scenes": sum(scene.blank for scene in scenes),
     }
-    summary |= {m: _mean([scene.mean(m) for scene in scenes]) for m in IMAGE_METRICS}
+    summary |= {m: _mean([scene.mean(m) for scene in scenes]) for m in (*IMAGE_METRICS, *SCENE_METRICS)}
+    summary["consistency_n"] = sum(scene.mean("consistency_psnr") is not None for scene in scenes) or None
     if summary["blank_scenes"]:
         others = [scene for scene in scenes if not scene.blank]
         for m in ("psnr", "ssim", "lpips", "st_lpips_vgg"):

@@ -1,32 +1,27 @@
 """Test-time fine-tuning of one scene's field with the frozen CDM (paper, "Fine-tuning Phase")."""
 
-from dataclasses import dataclass
+import math
 
 import torch
 import torch.nn.functional as F
 from lightning import LightningModule
 from torch import Tensor
 
+from nerfdiff.cameras import Cameras
 from nerfdiff.distill.ray_batches import RayBatches
 from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.distill.teacher import Teacher
+from nerfdiff.distill.trace import Step
 from nerfdiff.distill.virtual_views import Images, VirtualViews
+from nerfdiff.errors import ConfigError
 from nerfdiff.randomness import generator
 
-
-@dataclass(frozen=True)
-class Step:
-    """One line of the trace.
-
-    Args:
-        loss: mean squared error of the inner steps' rays, first and last.
-        weight: of guidance, where there is any.
-        agreement: PSNR of the field's renderings against the targets before they were fitted.
-    """
-
-    loss: tuple[float, float] | None
-    weight: float | None
-    agreement: float
+DECAYS = {
+    "none": lambda done: 1.0,
+    "linear": lambda done: 1 - done,
+    "cosine": lambda done: 0.5 * (1 + math.cos(math.pi * done)),
+}
+"""Factors of the learning rates, by the share of the teacher's steps that are done."""
 
 
 class NGDModule(LightningModule):
@@ -41,7 +36,12 @@ class NGDModule(LightningModule):
         inner_steps: N, Adam steps after each of the teacher's.
         rays: B, per inner step.
         lr_planes, lr_decoder: learning rates of W and θ.
+        lr_decay: of both, over the teacher's steps: `none`, `linear` or `cosine`.
+        fit_source: whether the input image, the one view that is known, is fitted beside the virtual views.
         seed: of the rays.
+
+    Raises:
+        ConfigError: another `lr_decay`.
     """
 
     def __init__(
@@ -53,6 +53,8 @@ class NGDModule(LightningModule):
         rays: int,
         lr_planes: float,
         lr_decoder: float,
+        lr_decay: str,
+        fit_source: bool,
         seed: tuple[int | str, ...],
     ):
         super().__init__()
@@ -60,7 +62,10 @@ class NGDModule(LightningModule):
         self.field = field
         self.views, self.teacher = views, teacher
         self.inner_steps, self.rays = inner_steps, rays
-        self.lr_planes, self.lr_decoder = lr_planes, lr_decoder
+        if lr_decay not in DECAYS:
+            raise ConfigError(f"strategy.lr_decay={lr_decay!r}: choose {', '.join(DECAYS)}")
+        self.lr_planes, self.lr_decoder, self.lr_decay = lr_planes, lr_decoder, lr_decay
+        self.fit_source = fit_source
         self.seed = seed
         self.trace: list[Step] = []
         self.status = "ok"
@@ -69,13 +74,15 @@ class NGDModule(LightningModule):
         """The teacher's steps."""
         return range(self.teacher.steps)
 
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        return torch.optim.Adam(
+    def configure_optimizers(self) -> tuple[list, list]:
+        optimizer = torch.optim.Adam(
             [
                 {"params": [self.field.planes], "lr": self.lr_planes},
                 {"params": self.field.decoder.parameters(), "lr": self.lr_decoder},
             ]
         )
+        decay, steps = DECAYS[self.lr_decay], self.teacher.steps
+        return [optimizer], [torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: decay(step / steps))]
 
     def on_train_start(self) -> None:
         self._start = self.field.snapshot()
@@ -86,9 +93,10 @@ class NGDModule(LightningModule):
         rendered = self._renderings()
         targets = self.teacher.targets(step, rendered)
         losses = self._fit(targets)
+        self.lr_schedulers().step()
         agreement = -10 * torch.log10(F.mse_loss(rendered, targets) + 1e-6)
-        ends = (float(losses[0]), float(losses[-1])) if len(losses) else None
-        self.trace.append(Step(ends, self.teacher.weight, float(agreement)))
+        first, last = (float(losses[0]), float(losses[-1])) if len(losses) else (None, None)
+        self.trace.append(Step(self.teacher.t, self.teacher.weight, first, last, float(agreement)))
         if bool(torch.isfinite(losses).all()) and self.field.is_finite():
             self._good, self._last_targets = self.field.snapshot(), targets
         else:
@@ -109,7 +117,11 @@ class NGDModule(LightningModule):
     def _fit(self, targets: Images) -> Tensor:
         """N inner steps; their losses."""
         optimizer, renderer = self.optimizers(), self.views.model.renderer
-        batches = RayBatches(self.views.cameras, self.field.near, self.field.far, targets, self._generator)
+        cameras = self.views.cameras
+        if self.fit_source:
+            cameras = Cameras.join([cameras[0], self.field.cameras])[None]
+            targets = torch.cat([targets, self.views.encoding.source])
+        batches = RayBatches(cameras, self.field.near, self.field.far, targets, self._generator)
         losses = []
         for _ in range(self.inner_steps):
             rays, colours, jitter = batches.draw(self.rays, renderer.samples_per_ray)

@@ -34,7 +34,8 @@ class ResultRow:
 
     Timings are dicts {n, median, iqr} in seconds, see `timing`: `encode_s` and `distill_s` per scene,
     `render_s` per view. `fid_n` is the number of images on either side of `fid` and `fd_st_vgg`; `n_views`
-    counts all scored images.
+    counts all scored images, `consistency_n` the scenes behind the two numbers of consistency. `fallbacks` counts
+    the scenes whose distillation failed and which kept an earlier field; `error` says how.
     """
 
     # identity
@@ -69,9 +70,15 @@ class ResultRow:
     fid_n: int | None = None
     st_lpips_vgg: float | None = None
     fd_st_vgg: float | None = None
+    sharpness: float | None = None
     depth_abs_rel: float | None = None
     depth_rmse: float | None = None
     mask_iou: float | None = None
+    floaters: float | None = None
+    depth_extent: float | None = None
+    consistency_psnr: float | None = None
+    consistency_psnr_truth: float | None = None
+    consistency_n: int | None = None
     blank_scenes: int | None = None
     psnr_without_blank: float | None = None
     ssim_without_blank: float | None = None
@@ -94,6 +101,7 @@ class ResultRow:
     lightning: str | None = None
     hydra: str | None = None
     # stability
+    fallbacks: int | None = None
     nonfinite_grad_steps: int | None = None
     loss_spikes: int | None = None
     grad_norm_p99: float | None = None

@@ -30,10 +30,15 @@ COLUMNS = (
     Column("fid", "FID ↓", ".2f"),
     Column("st_lpips_vgg", "ST-LPIPS ↓", ".3f"),
     Column("fd_st_vgg", "FD ST-VGG ↓", ".2f"),
+    Column("sharpness", "sharpness (1)", ".2f"),
     Column("fid_n", "images"),
     Column("depth_abs_rel", "depth abs rel ↓", ".3f"),
     Column("depth_rmse", "depth RMSE ↓", ".3f"),
     Column("mask_iou", "mask IoU ↑", ".3f"),
+    Column("floaters", "floaters ↓", ".3f"),
+    Column("depth_extent", "depth extent (1)", ".2f"),
+    Column("consistency_psnr", "consistency PSNR ↑", ".2f"),
+    Column("consistency_psnr_truth", "of truth", ".2f"),
     Column("encode_s_median", "encode, s", ".3g"),
     Column("render_s_median", "render, s/view", ".3g"),
     Column("distill_s_median", "distil, s", ".3g"),
@@ -43,6 +48,7 @@ COLUMNS = (
     Column("weights", "weights"),
     Column("seed", "seed"),
     Column("n_scenes", "scenes"),
+    Column("fallbacks", "fell back"),
     Column("device", "device"),
 )
 

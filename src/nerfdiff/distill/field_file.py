@@ -1,0 +1,77 @@
+"""A refined field on disk: safetensors, with the camera it lives in and all else that rendering it takes."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from nerfdiff.cameras import Cameras
+from nerfdiff.distill.refined_field import RefinedField
+from nerfdiff.errors import DataError
+from nerfdiff.field.decoder import Decoder
+from nerfdiff.field.triplane import Triplane
+from nerfdiff.render.renderer import Renderer
+from nerfdiff.results.files import atomic
+
+FIELD = "field.safetensors"
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class SavedField:
+    """A field and the renderer it was fitted with.
+
+    Args:
+        field: on the CPU, of one scene.
+        renderer: its samples per ray, background and chunk.
+    """
+
+    field: RefinedField
+    renderer: Renderer
+
+
+def save_field(path: str | Path, saved: SavedField) -> None:
+    """Write planes and decoder as float32, and the rest as JSON in the file's header (key `nerfdiff`).
+
+    Raises:
+        DataError: the file cannot be written.
+    """
+    field = saved.field
+    header = {
+        "format": FORMAT,
+        "camera": {"K": field.cameras.K[0].tolist(), "height": field.cameras.height, "width": field.cameras.width},
+        "near": float(field.near),
+        "far": float(field.far),
+        "decoder": field.decoder.settings,
+        "render": asdict(saved.renderer),
+    }
+    state = {name: value.detach().cpu().contiguous() for name, value in field.state_dict().items()}
+    with atomic(Path(path)) as temporary:
+        save_file(state, temporary, {"nerfdiff": json.dumps(header)})
+
+
+def load_field(path: str | Path) -> SavedField:
+    """Read what `save_field` wrote; needs no checkpoint.
+
+    Raises:
+        DataError: the file is missing, damaged, or something else.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads(file.metadata()["nerfdiff"])
+            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, it is no mapping
+        if header["format"] != FORMAT:
+            raise DataError(f"{path}: format {header['format']!r}, expected {FORMAT}; distil the scene again")
+        camera = header["camera"]
+        cameras = Cameras(torch.eye(4)[None], torch.tensor([camera["K"]]), camera["height"], camera["width"])
+        bounds = (torch.tensor([header[name]]) for name in ("near", "far"))
+        field = RefinedField(Triplane(state["planes"], cameras, *bounds), Decoder(**header["decoder"]))
+        field.load_state_dict(state)
+        return SavedField(field, Renderer(**header["render"]))
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise DataError(
+            f"{path}: not a field saved by this project ({type(error).__name__}: {error}); distil the scene again"
+        ) from error

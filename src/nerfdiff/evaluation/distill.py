@@ -1,0 +1,104 @@
+"""One strategy over the scenes of a dataset, or over one picture, on one or several processes."""
+
+import logging
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from hydra.utils import instantiate
+from lightning import Fabric
+from omegaconf import DictConfig
+
+from nerfdiff.distill.strategy import Strategy
+from nerfdiff.errors import ConfigError
+from nerfdiff.evaluation.evaluate import show
+from nerfdiff.evaluation.measure import measure, record_failure
+from nerfdiff.evaluation.pictures import sheet
+from nerfdiff.evaluation.predict import predict
+from nerfdiff.evaluation.subject import Subject, choose_device, dataset_subject, picture_subject
+from nerfdiff.results.row import ResultRow
+
+log = logging.getLogger(__name__)
+
+
+def distill(cfg: DictConfig) -> ResultRow | None:
+    """Run `cfg.strategy` over the test scenes of `cfg.data`, or over the picture `cfg.image`.
+
+    Leaves in `<cfg.paths.output_dir>/<strategy>-<identity>/predictions/<strategy>/<scene>/` the rendered views, the
+    field, its trace and an orbit; beside them scores and a contact sheet, and a row in `cfg.results`. Scenes that
+    are done are skipped. Every process makes its share of the scenes.
+
+    Returns:
+        the row; None for a picture, whose other views nobody knows, and in all processes but the first.
+
+    Raises:
+        UserError: bad data, picture, config or checkpoint. A run over a dataset is appended as a failed row first;
+            within a sweep the row is all, and the other jobs go on.
+    """
+    subject, strategy = None, None
+    try:
+        fabric = _launch(cfg)
+        subject = picture_subject(cfg, fabric.device) if cfg.image else dataset_subject(cfg, fabric.device)
+        strategy, scorer = instantiate(cfg.strategy), instantiate(cfg.metrics)
+        _predict_together(fabric, subject, strategy)
+        if fabric.global_rank > 0:
+            return None
+        row = measure(subject, strategy, scorer, subject.data.reader("test")) if subject.data else None
+    except Exception as error:
+        if cfg.image or _rank() > 0:
+            raise
+        row = record_failure(cfg, error, subject, strategy)
+        if _in_a_sweep():
+            log.exception("this job of the sweep failed")
+            return row
+        raise
+    if cfg.sheet.scenes > 0:
+        log.info("contact sheet: %s", sheet(subject, [strategy], subject.folder / "sheet.png"))
+    if row is not None:
+        show([row], subject.folder / "table.md")
+    log.info("fields, traces and orbits: %s", subject.predictions / strategy.name)
+    return row
+
+
+def _rank() -> int:
+    return torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
+
+
+def _in_a_sweep() -> bool:
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+
+
+def _launch(cfg: DictConfig) -> Fabric:
+    """The processes that share the scenes: one per GPU, or several on the CPU.
+
+    Raises:
+        ConfigError: there are not as many devices, or every job of a sweep would launch its own.
+    """
+    device = choose_device(cfg.device)
+    if cfg.processes < 1 or (device.type == "cuda" and cfg.processes > torch.cuda.device_count()):
+        raise ConfigError(f"processes={cfg.processes} must be at least 1, and on GPUs at most one for each")
+    many = cfg.processes > 1
+    if many and _in_a_sweep():
+        raise ConfigError("processes is for a single run: the jobs of a sweep take one each, side by side if at all")
+    if many and device.index is not None:
+        raise ConfigError(f"device={cfg.device} is one device: say device={device.type} with processes={cfg.processes}")
+    devices = [device.index or 0] if device.type == "cuda" and not many else cfg.processes
+    fabric = Fabric(accelerator=device.type, devices=devices, strategy="ddp" if many else "auto")
+    fabric.launch()
+    if cfg.threads is not None:
+        torch.set_num_threads(cfg.threads)
+    return fabric
+
+
+def _predict_together(fabric: Fabric, subject: Subject, strategy: Strategy) -> None:
+    """Each process its share; if one of them fails all end, instead of waiting for it."""
+    failure: Exception | None = None
+    try:
+        predict(subject, strategy, fabric.global_rank, fabric.world_size)
+    except Exception as error:
+        failure = error
+    failed = fabric.all_reduce(torch.tensor(float(failure is not None), device=fabric.device), reduce_op="sum")
+    if failure is not None:
+        raise failure
+    if failed > 0:
+        raise RuntimeError(f"{int(failed)} of {fabric.world_size} processes failed; their messages are above")

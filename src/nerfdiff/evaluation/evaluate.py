@@ -1,0 +1,67 @@
+"""One evaluation: predictions first, scores after, a row of results, pictures."""
+
+import logging
+import sys
+from pathlib import Path
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from rich.console import Console
+
+from nerfdiff.distill.baselines import CopyInput, MeanImage, mean_training_image
+from nerfdiff.distill.strategy import Strategy
+from nerfdiff.evaluation.measure import measure, record_failure
+from nerfdiff.evaluation.pictures import sheet, video
+from nerfdiff.evaluation.predict import predict
+from nerfdiff.evaluation.subject import choose_device, dataset_subject
+from nerfdiff.results.row import ResultRow
+from nerfdiff.results.table import rich_table, write_markdown
+
+log = logging.getLogger(__name__)
+
+
+def evaluate(cfg: DictConfig) -> list[ResultRow]:
+    """Evaluate `cfg.strategy`, and the baselines beside it, on one split of a dataset.
+
+    Leaves in `<cfg.paths.output_dir>/<strategy>-<identity>/`: `predictions/<strategy>/`, `scores/<strategy>/`, a
+    contact sheet, an orbit video and a table; appends a row per strategy to `cfg.results`. Scenes already predicted
+    by the same model with the same settings on the same files are not predicted again.
+
+    Returns:
+        the strategy's row, then the baselines'.
+
+    Raises:
+        UserError: bad data, config or checkpoint. A strategy that fails is appended as a row with its status first.
+    """
+    if cfg.threads is not None:
+        torch.set_num_threads(cfg.threads)
+    subject = dataset_subject(cfg, choose_device(cfg.device))
+    reader = subject.data.reader("test")
+    strategies: list[Strategy] = [instantiate(cfg.strategy)]
+    if cfg.baselines:
+        mean = mean_training_image(subject.data.reader("train"), cfg.mean_image_scenes, cfg.seed)
+        strategies += [CopyInput(), MeanImage(mean)]
+    scorer = instantiate(cfg.metrics)
+    rows = []
+    for strategy in strategies:
+        try:
+            predict(subject, strategy)
+            rows.append(measure(subject, strategy, scorer, reader))
+        except Exception as error:
+            record_failure(cfg, error, subject, strategy)
+            raise
+    if cfg.sheet.scenes > 0:
+        log.info("contact sheet: %s", sheet(subject, strategies, subject.folder / "sheet.png"))
+    if cfg.orbit.scenes > 0:
+        log.info("video: %s", video(subject, strategies[0], subject.folder / "orbit.mp4"))
+    show(rows, subject.folder / "table.md")
+    log.info("rows: %s   scores per image and scene: %s", cfg.results, subject.folder / "scores")
+    return rows
+
+
+def show(rows: list[ResultRow], path: Path) -> None:
+    """Print the table, and write it down."""
+    write_markdown(path, rows)
+    console = Console(width=None if sys.stdout.isatty() else 200)
+    console.print(rich_table(rows, console.width))

@@ -1,0 +1,115 @@
+"""Scene after scene: predictions, and what is left beside them."""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning import Callback
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from nerfdiff.callbacks.distillation_bar import DistillationBar
+from nerfdiff.data.batch import ViewBatch
+from nerfdiff.distill.field_file import FIELD, SavedField, load_field, save_field
+from nerfdiff.distill.strategy import Strategy, Views
+from nerfdiff.distill.trace import PLOT, TRACE, plot_trace, write_trace
+from nerfdiff.evaluation.subject import Subject
+from nerfdiff.metrics.image import psnr
+from nerfdiff.metrics.predictions import SCENE, PredictionWriter
+from nerfdiff.orbit import orbit
+from nerfdiff.results.pictures import orbit_video
+from nerfdiff.results.timing import Stopwatch
+
+ORBIT = "orbit.mp4"
+
+
+def predict(subject: Subject, strategy: Strategy, rank: int = 0, processes: int = 1) -> None:
+    """Predict what is still to do of one process's share; a killed run loses at most the scene in hand."""
+    writer = _writer(subject, strategy)
+    pending = writer.pending()[rank::processes]
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[told]}"),
+        disable=rank > 0 or not sys.stderr.isatty(),
+        console=Console(stderr=True),
+    ) as bar:
+        task = bar.add_task(strategy.name, total=len(pending), told="")
+        watch = DistillationBar(lambda told: bar.update(task, told=told))
+        for scene in subject.load(pending) if pending else ():
+            scene = scene.to(subject.device)
+            score = _predict_scene(subject, strategy, writer, scene, [watch])
+            bar.update(task, advance=1, told="" if score is None else f"PSNR {score:.2f}")
+
+
+def _predict_scene(
+    subject: Subject, strategy: Strategy, writer: PredictionWriter, scene: ViewBatch, callbacks: Sequence[Callback]
+) -> float | None:
+    """PSNR, where there is a truth."""
+    watch = Stopwatch(subject.device)
+    with watch.measure(), subject.autocast():
+        views = strategy.predict(subject.model, scene, subject.cfg.seed, callbacks)
+    writer.write(
+        scene.scene_ids[0],
+        scene.target_views[0],
+        views.images,
+        scene.source_views,
+        depth=views.depth,
+        opacity=views.opacity,
+        cost={
+            "seconds": watch.seconds[0],
+            "denoiser_calls": views.denoiser_calls,
+            "field_queries": views.field_queries,
+        },
+        status=views.status,
+        beside=partial(_leave, subject, strategy, scene, views) if subject.cfg.per_scene else None,
+    )
+    return psnr(views.images.clamp(0, 1), scene.targets[0]).mean().item() if subject.data else None
+
+
+def _leave(subject: Subject, strategy: Strategy, scene: ViewBatch, views: Views, folder: Path) -> None:
+    """The field, its trace and an orbit in the scene's folder."""
+    if views.field is not None:
+        save_field(folder / FIELD, views.field)
+    if views.trace:
+        write_trace(folder / TRACE, views.trace)
+        plot_trace(folder / PLOT, views.trace)
+    if subject.cfg.orbit.frames > 0:
+        orbit_video(folder / ORBIT, orbit_frames(subject, strategy, scene, views.field), subject.cfg.orbit.fps)
+
+
+@torch.no_grad()
+def orbit_frames(subject: Subject, strategy: Strategy, scene: ViewBatch, saved: SavedField | None) -> torch.Tensor:
+    """A circle around the object [frames, 3, height, width]: of the field, or predicted where there is none."""
+    cameras = orbit(scene.source_cameras, scene.target_cameras[0], subject.cfg.orbit.frames)[None]
+    if saved is not None:
+        field = saved.field.to(subject.device)
+        return field.render(saved.renderer, cameras).rgb[0].movedim(-1, 1).cpu()
+    frames = scene.source_pixels[:, None].expand(-1, cameras.shape[1], -1, -1, -1)
+    view = replace(scene, target_cameras=cameras, target_pixels=frames, target_depth=None, target_mask=None)
+    with subject.autocast():
+        return strategy.predict(subject.model, view, subject.cfg.seed).images.cpu()
+
+
+def saved_field(subject: Subject, strategy: Strategy, scene_id: str) -> SavedField | None:
+    """The field that `predict` left, if the strategy has one and it was kept."""
+    path = subject.predictions / strategy.name / scene_id / FIELD
+    return load_field(path) if path.is_file() else None
+
+
+def costs(subject: Subject, strategy: Strategy) -> list[dict[str, Any]]:
+    """What each scene cost to predict, and its status."""
+    folder = _writer(subject, strategy).folder
+    facts = [json.loads((folder / scene / SCENE).read_text()) for scene in subject.scene_ids]
+    return [fact["cost"] | {"status": fact["status"]} for fact in facts]
+
+
+def _writer(subject: Subject, strategy: Strategy) -> PredictionWriter:
+    return PredictionWriter(subject.predictions, strategy.name, subject.scene_ids, subject.identity)

@@ -1,0 +1,156 @@
+"""What is evaluated on what: a model, scenes, and all that predictions of one run share."""
+
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from nerfdiff.checkpoint import LoadedModel, load_model
+from nerfdiff.data.batch import ViewBatch
+from nerfdiff.data.datamodule import SceneDataModule
+from nerfdiff.errors import ConfigError
+from nerfdiff.model import NerfDiff
+from nerfdiff.results.hashes import sha256_file, sha256_values
+from nerfdiff.training import auto_precision, plain
+
+PRECISIONS = ("32-true", "bf16-mixed")
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A model and scenes, on a device.
+
+    Args:
+        cfg: of evaluate.py or distill.py.
+        load: batches of one scene each, of these ids.
+        identity: what makes predictions comparable; other settings of it, other predictions.
+        folder: of all that the run leaves.
+        data: where the scenes come from; None for a picture, whose other views nobody knows.
+    """
+
+    cfg: DictConfig
+    model: NerfDiff
+    load: Callable[[Sequence[str]], Iterable[ViewBatch]]
+    scene_ids: list[str]
+    device: torch.device
+    precision: str
+    identity: dict[str, Any]
+    folder: Path
+    data: SceneDataModule | None
+
+    @property
+    def predictions(self) -> Path:
+        return self.folder / "predictions"
+
+    def autocast(self) -> AbstractContextManager:
+        """bf16 products where the precision asks for them."""
+        if self.precision == "32-true":
+            return nullcontext()
+        return torch.autocast(self.device.type, torch.bfloat16)
+
+
+def choose_device(name: str) -> torch.device:
+    """A device by its name, or by what there is.
+
+    Raises:
+        ConfigError: it cannot be used here.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # the latter where PyTorch was built without CUDA
+        raise ConfigError(
+            f"device={name} cannot be used here ({str(error).splitlines()[0]}); try device=auto"
+        ) from error
+    return device
+
+
+def dataset_subject(cfg: DictConfig, device: torch.device) -> Subject:
+    """The test scenes of `cfg.data`.
+
+    Raises:
+        UserError: bad data, config or checkpoint.
+    """
+    loaded = load_model(cfg.ckpt, cfg.weights, cfg.paths.assets_dir)
+    datamodule = instantiate(cfg.data)
+    datamodule.setup("test")
+    reader = datamodule.reader("test")
+    scene_ids = [reader.scene_id(index) for index in datamodule.test_set.indices]
+    position = {name: index for index, name in enumerate(scene_ids)}
+
+    def load(names: Sequence[str]) -> Iterable[ViewBatch]:
+        return datamodule.scenes([position[name] for name in names])
+
+    size = list(next(iter(load(scene_ids[:1]))).source.shape[-2:])
+    if loaded.image_size is not None and loaded.image_size != size:
+        # a model is good at the resolution it was trained at; at another its numbers say little of it
+        raise ConfigError(
+            f"{loaded.path} was trained on images of {loaded.image_size}, the data gives {size}: "
+            f"set data.image_size=[{loaded.image_size[0]},{loaded.image_size[1]}]"
+        )
+    facts = {
+        "split_sha256": sha256_values(scene_ids),
+        "files_sha256": reader.fingerprint(),
+        "views": [cfg.data.source_view, cfg.data.eval_stride],
+        "image_size": size,
+        "mean_image_scenes": cfg.get("mean_image_scenes"),  # of a baseline that only evaluate.py has
+    }
+    return _subject(cfg, device, loaded, load, scene_ids, facts, datamodule)
+
+
+def picture_subject(cfg: DictConfig, device: torch.device) -> Subject:
+    """The scene on the picture `cfg.image`, to be seen from `cfg.shown_views`.
+
+    Raises:
+        UserError: bad picture, config or checkpoint.
+    """
+    loaded = load_model(cfg.ckpt, cfg.weights, cfg.paths.assets_dir)
+    size = loaded.image_size or plain(cfg.picture_size)
+    if size is None:
+        raise ConfigError(f"{loaded.path} does not say what image size it is for: give picture_size=[height,width]")
+    picture = instantiate(cfg.picture)
+    scene = picture.load(cfg.image, tuple(size))
+    cameras = instantiate(cfg.shown_views)(scene)
+    blank = scene.source_pixels[:, None].expand(-1, cameras.shape[1], -1, -1, -1)
+    names = tuple(f"{view:03d}" for view in range(cameras.shape[1]))
+    scene = replace(scene, target_cameras=cameras, target_pixels=blank, target_views=(names,))
+    facts = {
+        "files_sha256": [sha256_file(file) for file in (cfg.image, cfg.picture.mask) if file],
+        "picture": plain(cfg.picture),
+        "shown_views": plain(cfg.shown_views),
+        "image_size": list(size),
+    }
+    return _subject(cfg, device, loaded, lambda names: [scene] * len(names), list(scene.scene_ids), facts, None)
+
+
+def _subject(
+    cfg: DictConfig,
+    device: torch.device,
+    loaded: LoadedModel,
+    load: Callable[[Sequence[str]], Iterable[ViewBatch]],
+    scene_ids: list[str],
+    facts: dict[str, Any],
+    data: SceneDataModule | None,
+) -> Subject:
+    precision = cfg.precision if cfg.precision != "auto" else auto_precision(device.type)
+    if precision not in PRECISIONS:
+        raise ConfigError(f"precision must be auto, {' or '.join(PRECISIONS)}, got {precision!r}")
+    identity = facts | {
+        "ckpt_sha256": sha256_file(loaded.path),
+        "weights": loaded.weights,
+        "seed": cfg.seed,
+        "precision": precision,
+        "strategy": plain(cfg.strategy),
+    }
+    folder = Path(cfg.paths.output_dir) / f"{cfg.strategy.name}-{sha256_values(identity)[:8]}"
+    model = loaded.model.to(device).requires_grad_(False)
+    if cfg.chunk is not None:
+        model.renderer = replace(model.renderer, chunk=cfg.chunk)
+    return Subject(cfg, model, load, scene_ids, device, precision, identity, folder, data)

@@ -1,0 +1,185 @@
+"""What a sweep measured: one line per group of jobs, over its seeds and scenes."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+
+from nerfdiff.errors import DataError
+from nerfdiff.metrics.summary import IMAGE_METRICS, SCENE_METRICS
+from nerfdiff.results.intervals import Bootstrap, Estimate, spread
+from nerfdiff.results.row import ResultRow
+from nerfdiff.results.sweep_jobs import Group, Labels, counterpart
+
+FRECHET = ("fid", "fd_st_vgg")  # one number for all scenes of a run
+PER_RUN = (*FRECHET, "distill_s")
+PER_SCENE = (*IMAGE_METRICS, *SCENE_METRICS)
+
+SceneValues = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of the table.
+
+    Args:
+        metrics: by the names of `ResultRow`. Where there are values per scene: their mean over seeds and scenes and its
+            interval. Else: the mean over seeds and its range.
+        differences: to the reference, scene by scene.
+        closed: how much of a Fréchet distance between the reference and the goal is closed; 1 is all of it.
+        paper: its numbers.
+        status: `ok`, or how many jobs are not.
+    """
+
+    labels: Labels
+    name: str
+    seeds: int
+    scenes: int
+    status: str
+    error: str | None
+    fallbacks: int
+    metrics: dict[str, Estimate] = field(default_factory=dict)
+    differences: dict[str, Estimate] = field(default_factory=dict)
+    closed: dict[str, float] = field(default_factory=dict)
+    paper: dict[str, float] = field(default_factory=dict)
+
+
+def lines_of(
+    groups: Sequence[Group],
+    folders: Mapping[str, Path],
+    bootstrap: Bootstrap,
+    reference: Mapping[str, str],
+    goal: Mapping[str, str],
+    paper: Sequence[Mapping[str, Any]],
+) -> list[Line]:
+    """A line per group.
+
+    Args:
+        folders: see `run_folders`.
+        reference: labels of the group that another is compared with, in place of its own.
+        goal: likewise, of the group at which a Fréchet distance is as low as it can get.
+        paper: numbers of the paper, each beside the labels `of` the group that they are for.
+
+    Raises:
+        DataError: a file of scores is damaged.
+    """
+    values = [over_seeds(group.rows, folders) for group in groups]
+    sets = [_per_run(group.rows) for group in groups]
+    lines = []
+    for group, scenes, runs in zip(groups, values, sets, strict=True):
+        other, aim = counterpart(group, groups, reference), counterpart(group, groups, goal)
+        differences, closed = {}, {}
+        if other is not None and other is not group:
+            differences = _differences(scenes, values[groups.index(other)], bootstrap)
+            if aim is not None:
+                closed = _closed(runs, sets[groups.index(other)], sets[groups.index(aim)])
+        lines.append(
+            Line(
+                labels=group.labels,
+                name=group.name,
+                seeds=len({row.seed for row in group.rows}),
+                scenes=len(scenes.get("psnr", ())),
+                status=_status(group),
+                error=_error(group),
+                fallbacks=sum(row.fallbacks or 0 for row in group.rows),
+                metrics={metric: bootstrap(_array(by_scene)) for metric, by_scene in scenes.items()} | runs,
+                differences=differences,
+                closed=closed,
+                paper=next((_numbers(entry) for entry in paper if _same(entry["of"], group.labels)), {}),
+            )
+        )
+    return lines
+
+
+def over_seeds(rows: Sequence[ResultRow], folders: Mapping[str, Path]) -> dict[str, SceneValues]:
+    """The mean over seeds of each metric in each scene, of scenes where all seeds have it."""
+    read = [
+        read_scenes(folders[row.config_sha256] / "scores" / row.strategy / "per_scene.csv")
+        for row in rows
+        if row.config_sha256 in folders
+    ]
+    values = {}
+    for metric in read[0] if read else ():
+        common = [scene for scene in read[0][metric] if all(scene in seed.get(metric, {}) for seed in read)]
+        if common:
+            values[metric] = {scene: fmean(seed[metric][scene] for seed in read) for scene in common}
+    return values
+
+
+def read_scenes(path: Path) -> dict[str, SceneValues]:
+    """What was measured of each scene, by metric.
+
+    Raises:
+        DataError: the file is missing or damaged.
+    """
+    values: dict[str, SceneValues] = {}
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                for metric in PER_SCENE:
+                    if row.get(metric):
+                        values.setdefault(metric, {})[row["scene"]] = float(row[metric])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path}: cannot be read ({error}); delete it and run the sweep again") from error
+    return values
+
+
+def _per_run(rows: Sequence[ResultRow]) -> dict[str, Estimate]:
+    found = {}
+    for name in PER_RUN:
+        values = [getattr(row, name) for row in rows if getattr(row, name) is not None]
+        if values:
+            found[name] = spread([float(value["median"] if isinstance(value, dict) else value) for value in values])
+    return found
+
+
+def _differences(
+    scenes: Mapping[str, SceneValues], others: Mapping[str, SceneValues], bootstrap: Bootstrap
+) -> dict[str, Estimate]:
+    """Scene by scene, so that what makes a scene hard cancels."""
+    found = {}
+    for metric, by_scene in scenes.items():
+        theirs = others.get(metric, {})
+        by_scene = {scene: value - theirs[scene] for scene, value in by_scene.items() if scene in theirs}
+        if by_scene:
+            found[metric] = bootstrap(_array(by_scene))
+    return found
+
+
+def _closed(
+    runs: Mapping[str, Estimate], start: Mapping[str, Estimate], end: Mapping[str, Estimate]
+) -> dict[str, float]:
+    closed = {}
+    for name in FRECHET:
+        if name in runs and name in start and name in end and start[name].mean > end[name].mean:
+            closed[name] = (start[name].mean - runs[name].mean) / (start[name].mean - end[name].mean)
+    return closed
+
+
+def _status(group: Group) -> str:
+    if not group.failed:
+        return "ok"
+    words = ", ".join(dict.fromkeys(job.status for job in group.failed))
+    return words if len(group.failed) == len(group.jobs) else f"{words} ({len(group.failed)} of {len(group.jobs)} jobs)"
+
+
+def _error(group: Group) -> str | None:
+    """What the jobs say, each saying once: also of scenes that fell back in jobs that succeeded."""
+    return "; ".join(dict.fromkeys(job.row.error for job in group.jobs if job.row and job.row.error)) or None
+
+
+def _array(values: SceneValues) -> np.ndarray:
+    # in the order of their names: the draws of scenes are then the same for every metric and group
+    return np.array([values[scene] for scene in sorted(values)])
+
+
+def _numbers(entry: Mapping[str, Any]) -> dict[str, float]:
+    return {name: value for name, value in entry.items() if name != "of"}
+
+
+def _same(of: Mapping[str, Any], labels: Labels) -> bool:
+    return {key: str(value) for key, value in of.items()} == labels

@@ -1,0 +1,94 @@
+"""The table at the end of a sweep: a Hydra callback."""
+
+import logging
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+from rich.console import Console
+
+from nerfdiff.errors import UserError
+from nerfdiff.evaluation.measure import record_failure
+from nerfdiff.results.files import write_text
+from nerfdiff.results.intervals import Bootstrap
+from nerfdiff.results.sweep_grid import grid
+from nerfdiff.results.sweep_jobs import Group, group, jobs_of, run_folders
+from nerfdiff.results.sweep_lines import Line, lines_of
+from nerfdiff.results.sweep_text import to_csv, to_markdown, to_rich
+
+log = logging.getLogger(__name__)
+
+
+class SweepTable(Callback):
+    """Writes table.csv and table.md into the sweep's folder after every job, and grid.png at the end.
+
+    The jobs of the command are the table: each with the newest row that it left in the sweep's results, so that a
+    sweep that goes on after it was killed has every job once. A job without a row is there as `not run`.
+
+    Args:
+        labels: keys of overrides that tell the table's rows apart; others that the command sweeps over are added.
+        reference, goal, paper: see `lines_of`.
+        bootstrap: of the intervals.
+    """
+
+    def __init__(
+        self,
+        labels: Sequence[str],
+        reference: Mapping[str, str],
+        goal: Mapping[str, str],
+        paper: Sequence[Mapping[str, Any]],
+        bootstrap: Bootstrap,
+    ):
+        self.labels, self.reference, self.goal = labels, reference, goal
+        self.paper, self.bootstrap = paper, bootstrap
+        self.sweep: DictConfig | None = None
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        self.sweep = config
+
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
+        """A failure that the job did not record itself becomes a row, and no longer ends the sweep without a table."""
+        try:
+            _ = job_return.return_value
+        except Exception as error:
+            log.exception("this job of the sweep failed")
+            job_return.status, job_return.return_value = JobStatus.COMPLETED, None
+            self._told(partial(self._record, config, error))
+        self._told(self._write)
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        self._told(self._finish)
+
+    def _told(self, work: Callable[[], object]) -> None:
+        try:
+            work()
+        except UserError as error:
+            log.error("the sweep's table: %s", error)
+
+    def _record(self, config: DictConfig, error: Exception) -> None:
+        overrides = set(config.hydra.overrides.task)
+        if not any(job.row for job in jobs_of(self.sweep) if set(job.overrides) == overrides):
+            record_failure(config, error, None, None)
+
+    def _write(self) -> tuple[list[Group], list[Line]]:
+        groups = group(jobs_of(self.sweep), self.labels)
+        lines = lines_of(groups, run_folders(self.sweep), self.bootstrap, self.reference, self.goal, self.paper)
+        folder = Path(self.sweep.hydra.sweep.dir)
+        write_text(folder / "table.csv", to_csv(lines))
+        write_text(folder / "table.md", to_markdown(lines))
+        return groups, lines
+
+    def _finish(self) -> None:
+        (groups, lines), folder = self._write(), Path(self.sweep.hydra.sweep.dir)
+        console = Console(width=None if sys.stdout.isatty() else 200)
+        console.print(to_rich(lines))
+        if not any(line.seeds for line in lines):
+            log.error("no job of this sweep succeeded; %s says why", folder / "table.md")
+            return
+        picture = grid(folder / "grid.png", self.sweep, groups, run_folders(self.sweep))
+        log.info("table: %s and .csv   pictures: %s", folder / "table.md", picture or "none")

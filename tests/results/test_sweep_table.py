@@ -1,0 +1,232 @@
+"""Tables of sweeps from rows and scores that are written by hand."""
+
+import csv
+import io
+import json
+import logging
+import math
+
+import numpy as np
+import pytest
+from hydra.core.utils import JobReturn, JobStatus
+from omegaconf import OmegaConf
+from rich.console import Console
+
+from nerfdiff.errors import DataError
+from nerfdiff.evaluation import measure
+from nerfdiff.metrics.predictions import FORMAT
+from nerfdiff.results.hashes import sha256_values
+from nerfdiff.results.intervals import Bootstrap
+from nerfdiff.results.row import ResultRow, append_row, read_rows
+from nerfdiff.results.sweep_jobs import counterpart, group, jobs_of, planned, run_folders
+from nerfdiff.results.sweep_lines import lines_of, read_scenes
+from nerfdiff.results.sweep_table import SweepTable
+from nerfdiff.results.sweep_text import to_csv, to_markdown, to_rich
+
+BOOTSTRAP = Bootstrap(resamples=200, level=0.95, seed=0)
+METRICS = {"psnr_floor": 1e-6}
+PSNR = {("none", 0): [20.0, 24.0], ("none", 1): [20.0, 24.0], ("ngd", 0): [21.0, 26.0], ("ngd", 1): [22.0, 25.0]}
+FD = {("none", 0): 300.0, ("none", 1): 300.0, ("ngd", 0): 180.0, ("ngd", 1): 160.0}
+
+
+def sweep(folder, params, *overrides):
+    """What Hydra hands to callbacks at the start of a multirun."""
+    hydra = {"sweep": {"dir": str(folder)}, "sweeper": {"params": params}, "overrides": {"task": list(overrides)}}
+    return OmegaConf.create({"hydra": hydra, "metrics": METRICS, "sheet": {"scenes": 2, "views": 1}, "data": {}})
+
+
+def write_job(folder, overrides, strategy, seed, psnr, **fields):
+    """A job that succeeded: its row, its plan and its scores."""
+    identity = {"strategy": strategy, "seed": seed}
+    run = folder / f"{strategy}-seed{seed}" / f"{strategy}-1234"
+    predictions, scores = run / "predictions" / strategy, run / "scores" / strategy
+    predictions.mkdir(parents=True)
+    scores.mkdir(parents=True)
+    (predictions / "plan.json").write_text(json.dumps({"format": FORMAT, "identity": identity, "scenes": ["a", "b"]}))
+    rows = [f"{scene},3,0,{value},0.8,,\n" for scene, value in zip("ab", psnr, strict=True)]
+    (scores / "per_scene.csv").write_text("scene,views,blank,psnr,ssim,lpips,floaters\n" + "".join(rows))
+    row = ResultRow(
+        run_id=f"{strategy}-{seed}",
+        config_sha256=sha256_values([identity, strategy, METRICS]),
+        overrides=list(overrides),
+        seed=seed,
+        strategy=strategy,
+        psnr=float(np.mean(psnr)),
+        **fields,
+    )
+    append_row(folder / "results.jsonl", row)
+
+
+@pytest.fixture
+def swept(tmp_path):
+    """none and ngd succeeded with two seeds; sds failed with one and was not run with the other."""
+    config = sweep(tmp_path, {"seed": "0,1", "strategy": "none,sds,ngd"}, "ckpt=demo")
+    for (strategy, seed), psnr in PSNR.items():
+        overrides = [f"seed={seed}", f"strategy={strategy}", "ckpt=demo"]
+        seconds = {"n": 2, "median": 4.0 + seed, "iqr": 0.0} if strategy == "ngd" else None
+        write_job(
+            tmp_path, overrides, strategy, seed, psnr, fd_st_vgg=FD[strategy, seed], distill_s=seconds, fallbacks=seed
+        )
+    failure = ["seed=0", "strategy=sds", "ckpt=demo"]
+    row = ResultRow(
+        run_id="sds", overrides=failure, seed=0, strategy="sds", status="oom", error="no [bold] memory | left"
+    )
+    append_row(tmp_path / "results.jsonl", row)
+    return config
+
+
+def lines(config, labels=("strategy",), reference=None, goal=None, paper=()):
+    groups = group(jobs_of(config), labels)
+    return lines_of(groups, run_folders(config), BOOTSTRAP, reference or {"strategy": "none"}, goal or {}, paper)
+
+
+def test_jobs_are_those_of_hydras_sweeper(tmp_path):
+    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    params = {
+        "seed": "0,1",
+        "strategy.teacher": "{}, {a:1,b:{c:x}}",
+        "budget.views": "range(5,8)",
+        "name": "choice(p,q)",
+    }
+    given = ["seed=3", "ckpt='a b'", "+new=1", "data.image_size=[1,2]"]
+    words = [f"{key}={value}" for key, value in params.items()]
+    (expected,) = BasicSweeper.split_arguments(OverridesParser.create().parse_overrides([*words, *given]), None)
+    assert [list(job) for job in planned(sweep(tmp_path, params, *given))] == expected
+    assert len(expected) == 2 * 3 * 2
+
+
+def test_means_are_over_seeds_and_scenes_and_differences_are_paired(swept):
+    none, sds, ngd = lines(swept)
+    assert (none.name, sds.name, ngd.name) == ("none", "sds", "ngd")
+    assert ngd.metrics["psnr"].mean == pytest.approx((21.0 + 26.0 + 22.0 + 25.0) / 4)
+    per_scene = np.array([21.5 - 20.0, 25.5 - 24.0])
+    assert ngd.differences["psnr"] == pytest.approx((1.5, 1.5, 1.5))  # both scenes gained as much
+    assert ngd.metrics["psnr"][1:] == BOOTSTRAP(np.array([21.5, 25.5]))[1:]
+    assert per_scene.mean() == ngd.differences["psnr"].mean
+    assert not none.differences and "lpips" not in ngd.metrics
+    assert ngd.metrics["fd_st_vgg"] == (170.0, 160.0, 180.0)
+    assert ngd.metrics["distill_s"] == (4.5, 4.0, 5.0)
+    assert (ngd.seeds, ngd.scenes, ngd.fallbacks, ngd.status) == (2, 2, 1, "ok")
+
+
+def test_failed_and_missing_jobs_are_a_line(swept):
+    sds = lines(swept)[1]
+    assert (sds.status, sds.seeds, sds.metrics) == ("oom, not run", 0, {})
+    assert sds.error == "no [bold] memory | left"
+
+
+def test_the_newest_row_of_a_job_counts(swept, tmp_path):
+    again = ["seed=0", "strategy=sds", "ckpt=demo"]
+    write_job(tmp_path, again, "sds", 0, [10.0, 11.0])
+    sds = lines(swept)[1]
+    assert (sds.status, sds.metrics["psnr"].mean) == ("not run (1 of 2 jobs)", 10.5)
+    assert len(read_rows(tmp_path / "results.jsonl")) == 6
+    late = ResultRow(run_id="x", overrides=["seed=0", "strategy=none", "ckpt=other"], seed=0, strategy="none", psnr=1.0)
+    append_row(tmp_path / "results.jsonl", late)  # of another command
+    assert lines(swept)[0].metrics["psnr"].mean == 22
+
+
+def test_the_share_of_the_frechet_gap(swept, tmp_path):
+    none, _, ngd = lines(swept, goal={"strategy": "ngd"})
+    assert ngd.closed == {"fd_st_vgg": 1.0} and none.closed == {}
+    swept.hydra.sweeper.params.strategy = "none,ngd,cdm"
+    for seed in (0, 1):
+        overrides = [f"seed={seed}", "strategy=cdm", "ckpt=demo"]
+        write_job(tmp_path, overrides, "cdm", seed, [19.0, 20.0], fd_st_vgg=100.0)
+    ngd = lines(swept, goal={"strategy": "cdm"})[1]
+    assert ngd.closed["fd_st_vgg"] == pytest.approx((300 - 170) / (300 - 100))
+
+
+def test_jobs_that_came_to_the_same_are_one(tmp_path):
+    """`none` has no virtual views: for any number of them its predictions are the same ones."""
+    config = sweep(tmp_path, {"strategy": "none,ngd", "budget.views": "5,10", "seed": "0"})
+    for views in (5, 10):
+        write_job(tmp_path / str(views), ["strategy=ngd", f"budget.views={views}", "seed=0"], "ngd", views, [21, 22])
+        write_job(tmp_path / str(views), ["strategy=none", f"budget.views={views}", "seed=0"], "none", 0, [20, 20])
+    for part in ("5", "10"):
+        for row in read_rows(tmp_path / part / "results.jsonl"):
+            append_row(tmp_path / "results.jsonl", row)
+    groups = group(jobs_of(config), ["strategy", "budget.views"])
+    assert [g.labels for g in groups] == [
+        {"strategy": "none"},
+        {"strategy": "ngd", "budget.views": "5"},
+        {"strategy": "ngd", "budget.views": "10"},
+    ]
+    assert counterpart(groups[2], groups, {"strategy": "none"}) is groups[0]
+    assert counterpart(groups[2], groups, {}) is None
+
+
+def test_a_reference_keeps_the_other_labels(tmp_path):
+    config = sweep(tmp_path, {"cdm": "a,b", "strategy": "none,ngd"})
+    groups = group(jobs_of(config), ["cdm", "strategy"])
+    found = counterpart(groups[3], groups, {"strategy": "none"})
+    assert (groups[3].name, found.name) == ("b ngd", "b none")
+
+
+def test_what_else_the_command_sweeps_over_is_a_label(tmp_path):
+    config = sweep(tmp_path, {"strategy": "none,ngd", "seed": "0,1"}, "budget.views=5,10", "ckpt=demo")
+    assert [g.name for g in group(jobs_of(config), ["strategy"])] == ["none 5", "none 10", "ngd 5", "ngd 10"]
+
+
+def test_paper_numbers_stand_beside_ours(swept):
+    paper = [{"of": {"strategy": "ngd"}, "psnr": 23.51, "fid": 18.09}]
+    found = lines(swept, paper=paper)
+    assert found[2].paper == {"psnr": 23.51, "fid": 18.09} and found[0].paper == {}
+    headings, _, *body = [line.strip("| ").split(" | ") for line in to_markdown(found).splitlines()[:5]]
+    ngd = dict(zip(headings, body[2], strict=True))
+    assert (ngd["paper: PSNR ↑"], ngd["paper: FID ↓"]) == ("23.51", "18.09")
+    assert ngd["PSNR ↑"].startswith("23.50 [21.50, 25.50") and ngd["Δ PSNR ↑"] == "+1.50 [+1.50, +1.50]"
+    assert ngd["FD ST-VGG ↓"] == "170.00 [160.00, 180.00]"
+
+
+def test_csv_and_terminal_show_every_line(swept):
+    found = lines(swept)
+    rows = list(csv.DictReader(io.StringIO(to_csv(found))))
+    assert [row["strategy"] for row in rows] == ["none", "sds", "ngd"]
+    assert float(rows[2]["psnr"]) == 23.5 and float(rows[2]["psnr_difference"]) == 1.5
+    assert float(rows[2]["fd_st_vgg_high"]) == 180 and rows[1]["psnr"] == ""
+    assert (rows[1]["status"], rows[1]["error"]) == ("oom, not run", "no [bold] memory | left")
+    console = Console(file=io.StringIO(), width=200)
+    console.print(to_rich(found))
+    assert "no [bold] memory | left" in console.file.getvalue()
+    assert "no [bold] memory \\| left" in to_markdown(found)
+
+
+def test_damaged_scores_are_named(tmp_path):
+    path = tmp_path / "per_scene.csv"
+    path.write_text("scene,views,blank,psnr\na,3,0,many\n")
+    with pytest.raises(DataError, match=r"per_scene\.csv"):
+        read_scenes(path)
+    path.write_text("scene,views,blank,psnr,ssim\na,3,0,nan,\n")
+    assert math.isnan(read_scenes(path)["psnr"]["a"]) and "ssim" not in read_scenes(path)
+
+
+def table():
+    return SweepTable(["strategy"], {"strategy": "none"}, {}, [], BOOTSTRAP)
+
+
+def test_a_failure_that_no_row_tells_of_becomes_one(tmp_path, monkeypatch):
+    overrides = ["strategy=none", "seed=0"]
+    monkeypatch.setattr(measure, "_overrides", lambda: overrides)  # Hydra's, of the job that has just ended
+    config = sweep(tmp_path, {"strategy": "none", "seed": "0"})
+    callback = table()
+    callback.on_multirun_start(config)
+    job = OmegaConf.merge(config, {"results": str(tmp_path / "results.jsonl"), "run_name": "x", "seed": 0})
+    job = OmegaConf.merge(job, {"strategy": {"name": "none"}, "hydra": {"overrides": {"task": overrides}}})
+    failed = JobReturn(overrides=overrides, status=JobStatus.FAILED, _return_value=OSError("disk full"))
+    callback.on_job_end(job, failed)
+    assert failed.status == JobStatus.COMPLETED  # Hydra would end the sweep at a failed one
+    (row,) = read_rows(tmp_path / "results.jsonl")
+    assert (row.status, row.error) == ("error", "disk full")
+    assert "disk full" in (tmp_path / "table.md").read_text()
+
+
+def test_a_sweep_without_any_success_says_so(tmp_path, caplog):
+    callback = table()
+    callback.on_multirun_start(sweep(tmp_path, {"strategy": "none", "seed": "0"}))
+    with caplog.at_level(logging.ERROR):
+        callback.on_multirun_end(OmegaConf.create())
+    assert "no job of this sweep succeeded" in caplog.text
+    assert "not run" in (tmp_path / "table.md").read_text() and not (tmp_path / "grid.png").exists()

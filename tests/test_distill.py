@@ -1,0 +1,202 @@
+"""The command from a checkpoint and scenes, or a picture, to fields."""
+
+import csv
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from nerfdiff.cli import load_config
+from nerfdiff.distill.distillation import Distillation
+from nerfdiff.distill.field_file import FIELD, load_field
+from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.evaluation.distill import distill
+from nerfdiff.metrics.predictions import read_prediction
+from nerfdiff.modules.ngd_module import NGDModule
+from nerfdiff.results.row import read_rows
+from training_fixtures import SRC, environment, run_training, write_dataset
+
+STEPS = 3
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return write_dataset(tmp_path_factory.mktemp("data"), scenes=2)
+
+
+@pytest.fixture(scope="module")
+def run(data, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    run_training(data, folder, "trainer.max_steps=2", "data.image_size=[20,28]")
+    return folder
+
+
+def overrides(data, run, out, *more) -> list[str]:
+    return [
+        f"ckpt={run}",
+        f"data.root={data}",
+        "data.cache=false",
+        "data.image_size=[20,28]",
+        "data.source_view=0",
+        "data.num_workers=0",
+        "budget=minutes",
+        f"budget.steps={STEPS}",
+        f"budget.sampler_steps={STEPS}",
+        "budget.inner_steps=2",
+        "budget.rays=64",
+        "budget.views=3",
+        "orbit.frames=3",
+        "timing.repeats=1",
+        "timing.warmup=0",
+        "metrics.st_lpips=false",
+        f"paths.output_dir={out}",
+        "threads=1",
+        *more,
+    ]
+
+
+def config(*arguments):
+    return load_config("distill", overrides(*arguments))
+
+
+def scene_folder(out, strategy, scene):
+    (folder,) = out.glob(f"{strategy}-*/predictions/{strategy}/{scene}")
+    return folder
+
+
+@pytest.mark.parametrize("strategy", ["ngd", "direct", "sds", "stochastic"])
+def test_every_scene_leaves_its_field_views_orbit_and_trace(strategy, data, run, tmp_path):
+    row = distill(config(data, run, tmp_path, f"strategy={strategy}"))
+    assert row.status == "ok" and row.n_scenes == 2 and row.fallbacks == 0 and row.psnr > 0
+    assert row.K == 3 and row.prior == "SRNSpiral"
+    for scene in ("scene0", "scene1"):
+        folder = scene_folder(tmp_path, strategy, scene)
+        for name in (FIELD, "trace.csv", "trace.png", "orbit.mp4"):
+            assert (folder / name).stat().st_size > 100, name
+        assert len(list((folder / "rgb").iterdir())) == 4
+        with open(folder / "trace.csv") as file:
+            trace = list(csv.DictReader(file))
+        assert len(trace) == STEPS and all(float(step["loss_last"]) > 0 for step in trace)
+        assert [bool(step["t"]) for step in trace] == [strategy == "ngd"] * STEPS
+    assert next(tmp_path.glob(f"{strategy}-*/sheet.png")).stat().st_size > 1000
+
+
+def test_the_field_in_the_file_is_the_one_whose_views_were_saved(data, run, tmp_path):
+    from nerfdiff.evaluation.subject import dataset_subject
+
+    cfg = config(data, run, tmp_path)
+    distill(cfg)
+    (scene,) = dataset_subject(cfg, torch.device("cpu")).load(["scene1"])
+    folder = scene_folder(tmp_path, "ngd", "scene1")
+    saved = load_field(folder / FIELD)
+    with torch.no_grad():
+        images = saved.field.render(saved.renderer, scene.target_cameras).rgb[0].movedim(-1, 1)
+    pixels = read_prediction(folder.parent, "scene1").pixels
+    assert (pixels / 255 - images.clamp(0, 1)).abs().max() < 0.51 / 255
+
+
+def test_scenes_that_are_done_are_not_made_again(data, run, tmp_path, monkeypatch):
+    predict, calls = Distillation.predict, []
+
+    def stopped_at_the_second(self, model, scene, *more):
+        calls.append(scene.scene_ids[0])
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return predict(self, model, scene, *more)
+
+    monkeypatch.setattr(Distillation, "predict", stopped_at_the_second)
+    with pytest.raises(KeyboardInterrupt):
+        distill(config(data, run, tmp_path))
+    row = distill(config(data, run, tmp_path))
+    assert calls == ["scene0", "scene1", "scene1"] and row.n_scenes == 2
+
+
+def test_a_scene_that_fell_back_says_so(data, run, tmp_path, monkeypatch):
+    fit = NGDModule._fit
+
+    def poisoned(self, targets):
+        if self.views.seed[-1] == "scene1" and len(self.trace) == 1:
+            targets = targets * float("nan")
+        return fit(self, targets)
+
+    monkeypatch.setattr(NGDModule, "_fit", poisoned)
+    row = distill(config(data, run, tmp_path))
+    assert row.status == "ok" and row.fallbacks == 1 and row.error == "fell back: 1 scenes non-finite"
+    with open(next(tmp_path.glob("ngd-*/scores/ngd/per_scene.csv"))) as file:
+        assert {line["scene"]: line["status"] for line in csv.DictReader(file)} == {
+            "scene0": "ok",
+            "scene1": "non-finite",
+        }
+    assert load_field(scene_folder(tmp_path, "ngd", "scene1") / FIELD).field.is_finite()
+
+
+def test_a_failure_is_a_row(data, run, tmp_path, monkeypatch):
+    def fails(*arguments):
+        raise MemoryError("no room")
+
+    monkeypatch.setattr(Distillation, "predict", fails)
+    with pytest.raises(MemoryError):
+        distill(config(data, run, tmp_path))
+    (row,) = read_rows(tmp_path / "results.jsonl")
+    assert (row.status, row.error, row.psnr) == ("oom", "no room", None)
+
+
+def test_a_run_that_cannot_begin_is_a_row_too(data, tmp_path):
+    with pytest.raises(DataError, match="nowhere"):
+        distill(config(tmp_path / "nowhere", SRC.parent / "assets" / "demo", tmp_path))
+    (row,) = read_rows(tmp_path / "results.jsonl")
+    assert row.status == "error" and "nowhere" in row.error and row.strategy == "ngd"
+
+
+@pytest.fixture
+def picture(tmp_path):
+    pixels = np.zeros((40, 60, 4), np.uint8)
+    pixels[10:30, 15:45] = (200, 30, 40, 255)
+    path = tmp_path / "red car.png"
+    Image.fromarray(pixels).save(path)
+    return path
+
+
+@pytest.mark.parametrize("strategy", ["none", "cdm", "ngd"])
+def test_one_picture_becomes_a_scene(strategy, data, run, tmp_path, picture):
+    out = tmp_path / "out"
+    more = (
+        f"strategy={strategy}",
+        f"image='{picture}'",
+        *(["prior@strategy.prior=sphere"] if strategy == "ngd" else []),
+    )
+    assert distill(config(data, run, out, *more)) is None
+    folder = scene_folder(out, strategy, "red_car")
+    facts = json.loads((folder / "scene.json").read_text())
+    assert len(facts["views"]) == 3 and facts["source_views"] == ["input"]
+    assert (folder / "orbit.mp4").is_file() and (folder / FIELD).is_file() == (strategy != "cdm")
+    assert next(out.glob(f"{strategy}-*/sheet.png")).stat().st_size > 1000
+    assert not (out / "results.jsonl").exists()
+
+
+def test_two_processes_make_what_one_does(data, run, tmp_path):
+    def command(out, *more):
+        arguments = overrides(data, run, out, f"paths.run_dir={out}", *more)
+        done = subprocess.run(
+            [sys.executable, str(SRC / "distill.py"), *arguments],
+            capture_output=True,
+            text=True,
+            env=environment(),
+            timeout=300,
+        )
+        assert done.returncode == 0, done.stderr[-3000:]
+        return read_rows(out / "results.jsonl")
+
+    (alone,) = command(tmp_path / "one")
+    (shared,) = command(tmp_path / "two", "processes=2")
+    assert shared.n_scenes == 2 and shared.psnr == pytest.approx(alone.psnr, abs=1e-6)
+
+
+@pytest.mark.parametrize("setting", ["processes=0", "device=cuda:7"])
+def test_processes_that_cannot_be_had_are_refused(setting, data, run, tmp_path):
+    with pytest.raises(ConfigError, match=setting.partition("=")[0]):
+        distill(config(data, run, tmp_path, setting))

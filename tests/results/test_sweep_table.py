@@ -18,7 +18,7 @@ from nerfdiff.metrics.predictions import FORMAT
 from nerfdiff.results.hashes import sha256_values
 from nerfdiff.results.intervals import Bootstrap
 from nerfdiff.results.row import ResultRow, append_row, read_rows
-from nerfdiff.results.sweep_jobs import counterpart, group, jobs_of, planned, run_folders
+from nerfdiff.results.sweep_jobs import counterpart, group, jobs_of, planned
 from nerfdiff.results.sweep_lines import lines_of, read_scenes
 from nerfdiff.results.sweep_table import SweepTable
 from nerfdiff.results.sweep_text import to_csv, to_markdown, to_rich
@@ -48,6 +48,7 @@ def write_job(folder, overrides, strategy, seed, psnr, **fields):
     row = ResultRow(
         run_id=f"{strategy}-{seed}",
         config_sha256=sha256_values([identity, strategy, METRICS]),
+        folder=str(run.relative_to(folder)),
         overrides=list(overrides),
         seed=seed,
         strategy=strategy,
@@ -77,7 +78,7 @@ def swept(tmp_path):
 
 def lines(config, labels=("strategy",), reference=None, goal=None, paper=()):
     groups = group(jobs_of(config), labels)
-    return lines_of(groups, run_folders(config), BOOTSTRAP, reference or {"strategy": "none"}, goal or {}, paper)
+    return lines_of(groups, BOOTSTRAP, reference or {"strategy": "none"}, goal or {}, paper)
 
 
 def test_jobs_are_those_of_hydras_sweeper(tmp_path):

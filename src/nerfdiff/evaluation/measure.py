@@ -1,9 +1,11 @@
 """Predictions to a row of results."""
 
 import logging
+import os
 import resource
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -60,6 +62,7 @@ def _identified(subject: Subject, strategy: Strategy) -> ResultRow:
     return ResultRow(
         run_id=f"{cfg.run_name}/{strategy.name}-{config_hash[:8]}",
         config_sha256=config_hash,
+        folder=os.path.relpath(subject.folder, Path(cfg.results).parent),
         overrides=_overrides(),
         seed=cfg.seed,
         dataset=f"{cfg.data.name}/{cfg.data.test_split}",

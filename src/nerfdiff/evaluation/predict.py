@@ -32,6 +32,8 @@ def predict(subject: Subject, strategy: Strategy, rank: int = 0, processes: int 
     """Predict what is still to do of one process's share; a killed run loses at most the scene in hand."""
     writer = _writer(subject, strategy)
     pending = writer.pending()[rank::processes]
+    if subject.device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(subject.device)
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),

@@ -32,10 +32,11 @@ Timing = dict[str, float | int]
 class ResultRow:
     """One measured run. None means not measured or not applicable.
 
-    Timings are dicts {n, median, iqr} in seconds, see `timing`: `encode_s` and `distill_s` per scene,
-    `render_s` per view. `fid_n` is the number of images on either side of `fid` and `fd_st_vgg`; `n_views`
-    counts all scored images, `consistency_n` the scenes behind the two numbers of consistency. `fallbacks` counts
-    the scenes whose distillation failed and which kept an earlier field; `error` says how.
+    `folder` is where predictions and scores lie, relative to the file of results. Timings are dicts
+    {n, median, iqr} in seconds, see `timing`: `encode_s` and `distill_s` per scene, `render_s` per view. `fid_n` is
+    the number of images on either side of `fid` and `fd_st_vgg`; `n_views` counts all scored images;
+    `consistency_n` scenes were measured for consistency. `fallbacks` counts the scenes whose distillation failed and
+    which kept an earlier field; `error` says how.
     """
 
     # identity
@@ -47,6 +48,7 @@ class ResultRow:
     git_sha: str | None = None
     git_dirty: bool | None = None
     config_sha256: str | None = None
+    folder: str | None = None
     overrides: list[str] | None = None
     seed: int | None = None
     dataset: str | None = None

@@ -1,7 +1,7 @@
 """Pictures of a sweep: some views of some scenes, as every row of its table has them."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -12,22 +12,18 @@ from nerfdiff.errors import UserError
 from nerfdiff.metrics.predictions import Prediction, read_plan, read_prediction
 from nerfdiff.metrics.score import Truth, truth_from
 from nerfdiff.results.pictures import contact_sheet
-from nerfdiff.results.sweep_jobs import Group
+from nerfdiff.results.sweep_jobs import Group, shown_predictions
 
 log = logging.getLogger(__name__)
 
 
-def grid(path: Path, sweep: DictConfig, groups: Sequence[Group], folders: Mapping[str, Path]) -> Path | None:
+def grid(path: Path, sweep: DictConfig, groups: Sequence[Group]) -> Path | None:
     """Save input and truth, where the dataset can still be read, and the first seed's predictions of every group.
 
     Returns:
         `path`; None where no job left predictions of the same views.
     """
-    shown = {
-        group.name: folders[group.rows[0].config_sha256] / "predictions" / group.rows[0].strategy
-        for group in groups
-        if group.rows and group.rows[0].config_sha256 in folders
-    }
+    shown = shown_predictions(groups)
     if not shown:
         return None
     scenes = [read_plan(folder)["scenes"] for folder in shown.values()]

@@ -6,10 +6,8 @@ from itertools import product
 from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from nerfdiff.metrics.predictions import read_plan
-from nerfdiff.results.hashes import sha256_values
 from nerfdiff.results.row import ResultRow, read_rows
 
 RESULTS = "results.jsonl"
@@ -26,16 +24,28 @@ class Job:
     Args:
         overrides: as its row has them.
         row: the newest that it left; None if there is none yet.
+        folder: of the sweep.
         labels: the values of those overrides that tell jobs apart, the seed left out.
     """
 
     overrides: tuple[str, ...]
     row: ResultRow | None
+    folder: Path
     labels: Labels = field(default_factory=dict)
 
     @property
     def status(self) -> str:
         return NOT_RUN if self.row is None else self.row.status
+
+    @property
+    def scores(self) -> Path:
+        """Of a job that succeeded."""
+        return self.folder / self.row.folder / "scores" / self.row.strategy
+
+    @property
+    def predictions(self) -> Path:
+        """Of a job that succeeded."""
+        return self.folder / self.row.folder / "predictions" / self.row.strategy
 
 
 @dataclass(frozen=True)
@@ -46,9 +56,8 @@ class Group:
     jobs: tuple[Job, ...]
 
     @property
-    def rows(self) -> list[ResultRow]:
-        """Of the jobs that succeeded."""
-        return [job.row for job in self.jobs if job.row is not None and job.row.status == "ok"]
+    def succeeded(self) -> list[Job]:
+        return [job for job in self.jobs if job.status == "ok"]
 
     @property
     def failed(self) -> list[Job]:
@@ -84,7 +93,7 @@ def jobs_of(sweep: DictConfig) -> list[Job]:
     """
     path = Path(sweep.hydra.sweep.dir) / RESULTS
     rows = {frozenset(row.overrides or ()): row for row in (read_rows(path) if path.is_file() else ())}
-    return [Job(overrides, rows.get(frozenset(overrides))) for overrides in planned(sweep)]
+    return [Job(overrides, rows.get(frozenset(overrides)), path.parent) for overrides in planned(sweep)]
 
 
 def group(jobs: Sequence[Job], keys: Sequence[str]) -> list[Group]:
@@ -120,12 +129,6 @@ def counterpart(of: Group, groups: Sequence[Group], labels: Mapping[str, str]) -
     return max(found, key=lambda other: len(other.labels), default=None) if labels else None
 
 
-def run_folders(sweep: DictConfig) -> dict[str, Path]:
-    """The folders that hold predictions and their scores, by the digest that their rows have."""
-    metrics = OmegaConf.to_container(sweep.metrics, resolve=True)
-    found = {}
-    for plan in Path(sweep.hydra.sweep.dir).glob("*/*/predictions/*/plan.json"):
-        strategy, run = plan.parent.name, plan.parents[2]
-        if (run / "scores" / strategy / "per_scene.csv").is_file():
-            found[sha256_values([read_plan(plan.parent)["identity"], strategy, metrics])] = run
-    return found
+def shown_predictions(groups: Sequence[Group]) -> dict[str, Path]:
+    """The folder of the first seed's predictions by the group's name, of groups that have one."""
+    return {group.name: group.succeeded[0].predictions for group in groups if group.succeeded}

@@ -13,7 +13,7 @@ from nerfdiff.errors import DataError
 from nerfdiff.metrics.summary import IMAGE_METRICS, SCENE_METRICS
 from nerfdiff.results.intervals import Bootstrap, Estimate, spread
 from nerfdiff.results.row import ResultRow
-from nerfdiff.results.sweep_jobs import Group, Labels, counterpart
+from nerfdiff.results.sweep_jobs import Group, Job, Labels, counterpart
 
 FRECHET = ("fid", "fd_st_vgg")  # one number for all scenes of a run
 PER_RUN = (*FRECHET, "distill_s")
@@ -50,7 +50,6 @@ class Line:
 
 def lines_of(
     groups: Sequence[Group],
-    folders: Mapping[str, Path],
     bootstrap: Bootstrap,
     reference: Mapping[str, str],
     goal: Mapping[str, str],
@@ -59,7 +58,6 @@ def lines_of(
     """A line per group.
 
     Args:
-        folders: see `run_folders`.
         reference: labels of the group that another is compared with, in place of its own.
         goal: likewise, of the group at which a Fréchet distance is as low as it can get.
         paper: numbers of the paper, each beside the labels `of` the group that they are for.
@@ -67,8 +65,8 @@ def lines_of(
     Raises:
         DataError: a file of scores is damaged.
     """
-    values = [over_seeds(group.rows, folders) for group in groups]
-    sets = [_per_run(group.rows) for group in groups]
+    values = [over_seeds(group.succeeded) for group in groups]
+    sets = [_per_run([job.row for job in group.succeeded]) for group in groups]
     lines = []
     for group, scenes, runs in zip(groups, values, sets, strict=True):
         other, aim = counterpart(group, groups, reference), counterpart(group, groups, goal)
@@ -81,11 +79,11 @@ def lines_of(
             Line(
                 labels=group.labels,
                 name=group.name,
-                seeds=len({row.seed for row in group.rows}),
+                seeds=len({job.row.seed for job in group.succeeded}),
                 scenes=len(scenes.get("psnr", ())),
                 status=_status(group),
                 error=_error(group),
-                fallbacks=sum(row.fallbacks or 0 for row in group.rows),
+                fallbacks=sum(job.row.fallbacks or 0 for job in group.succeeded),
                 metrics={metric: bootstrap(_array(by_scene)) for metric, by_scene in scenes.items()} | runs,
                 differences=differences,
                 closed=closed,
@@ -95,13 +93,9 @@ def lines_of(
     return lines
 
 
-def over_seeds(rows: Sequence[ResultRow], folders: Mapping[str, Path]) -> dict[str, SceneValues]:
+def over_seeds(jobs: Sequence[Job]) -> dict[str, SceneValues]:
     """The mean over seeds of each metric in each scene, of scenes where all seeds have it."""
-    read = [
-        read_scenes(folders[row.config_sha256] / "scores" / row.strategy / "per_scene.csv")
-        for row in rows
-        if row.config_sha256 in folders
-    ]
+    read = [read_scenes(job.scores / "per_scene.csv") for job in jobs]
     values = {}
     for metric in read[0] if read else ():
         common = [scene for scene in read[0][metric] if all(scene in seed.get(metric, {}) for seed in read)]

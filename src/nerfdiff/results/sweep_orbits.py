@@ -1,6 +1,6 @@
 """The orbits of a sweep in one video: a column for every row of its table, a row for every scene."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -11,23 +11,19 @@ from PIL import Image, ImageDraw, ImageFont
 from nerfdiff.evaluation.predict import ORBIT
 from nerfdiff.metrics.predictions import read_plan
 from nerfdiff.results.pictures import INK, PAPER, orbit_video
-from nerfdiff.results.sweep_jobs import Group
+from nerfdiff.results.sweep_jobs import Group, shown_predictions
 
 HEADING = 24
 """Pixels above each column for its name."""
 
 
-def orbits(path: Path, groups: Sequence[Group], folders: Mapping[str, Path], scenes: int, fps: float) -> Path | None:
+def orbits(path: Path, groups: Sequence[Group], scenes: int, fps: float) -> Path | None:
     """Save the orbits that the first seed's jobs left of the first scenes.
 
     Returns:
         `path`; None where not all jobs left orbits of the same scenes.
     """
-    shown = {
-        group.name: folders[group.rows[0].config_sha256] / "predictions" / group.rows[0].strategy
-        for group in groups
-        if group.rows and group.rows[0].config_sha256 in folders
-    }
+    shown = shown_predictions(groups)
     if not shown:
         return None
     planned = read_plan(next(iter(shown.values())))["scenes"]

@@ -17,15 +17,18 @@ from nerfdiff.evaluation.measure import record_failure
 from nerfdiff.results.files import write_text
 from nerfdiff.results.intervals import Bootstrap
 from nerfdiff.results.sweep_grid import grid
-from nerfdiff.results.sweep_jobs import Group, group, jobs_of, run_folders
+from nerfdiff.results.sweep_jobs import Group, group, jobs_of
 from nerfdiff.results.sweep_lines import Line, lines_of
+from nerfdiff.results.sweep_orbits import orbits
 from nerfdiff.results.sweep_text import to_csv, to_markdown, to_rich
 
 log = logging.getLogger(__name__)
 
+VIDEO_SCENES = 3
+
 
 class SweepTable(Callback):
-    """Writes table.csv and table.md into the sweep's folder after every job, and grid.png at the end.
+    """Writes table.csv and table.md into the sweep's folder after every job, and grid.png and orbits.mp4 at the end.
 
     The jobs of the command are the table: each with the newest row that it left in the sweep's results, so that a
     sweep that goes on after it was killed has every job once. A job without a row is there as `not run`.
@@ -77,7 +80,7 @@ class SweepTable(Callback):
 
     def _write(self) -> tuple[list[Group], list[Line]]:
         groups = group(jobs_of(self.sweep), self.labels)
-        lines = lines_of(groups, run_folders(self.sweep), self.bootstrap, self.reference, self.goal, self.paper)
+        lines = lines_of(groups, self.bootstrap, self.reference, self.goal, self.paper)
         folder = Path(self.sweep.hydra.sweep.dir)
         write_text(folder / "table.csv", to_csv(lines))
         write_text(folder / "table.md", to_markdown(lines))
@@ -90,5 +93,9 @@ class SweepTable(Callback):
         if not any(line.seeds for line in lines):
             log.error("no job of this sweep succeeded; %s says why", folder / "table.md")
             return
-        picture = grid(folder / "grid.png", self.sweep, groups, run_folders(self.sweep))
-        log.info("table: %s and .csv   pictures: %s", folder / "table.md", picture or "none")
+        pictures = [
+            grid(folder / "grid.png", self.sweep, groups),
+            orbits(folder / "orbits.mp4", groups, VIDEO_SCENES, self.sweep.orbit.fps),
+        ]
+        left = ", ".join(str(picture) for picture in pictures if picture)
+        log.info("table: %s and .csv   pictures: %s", folder / "table.md", left or "none")

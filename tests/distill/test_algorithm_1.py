@@ -91,6 +91,21 @@ def test_no_guidance_makes_numbers_that_are_none(gamma, t_min):
         assert all(torch.isfinite(field).all() for field in history)
 
 
+@pytest.mark.parametrize("w", [0.3, 0.7])
+def test_with_guidance_the_field_is_the_mean_of_uncertain_views_samples(w):
+    """Summed over views, x̃0 − x0 is w (f − x̄0), which vanishes with the step as f follows x̄0: whatever w < 1, the mean
+    of the views takes the Gaussian's own flow, from ε̄ to m̄ + s ε̄."""
+    history, _, views, _ = run(Guidance("constant", w, "current"), std=0.1, steps=4000)
+    expected = (views.means + views.std * views.fixed_noise).mean(0)
+    torch.testing.assert_close(history[-1], expected, atol=2e-3, rtol=0)
+
+
+def test_guidance_makes_uncertain_views_agree():
+    """Around their mean, views are pulled together: their spread is less than that of plain samples."""
+    spread = {w: run(Guidance("constant", w, "current"), std=0.1, steps=400)[3]._last.std(0).mean() for w in (0, 0.7)}
+    assert spread[0.7] < 0.8 * spread[0]
+
+
 def test_begun_at_less_than_one_the_views_are_the_noised_renderings():
     """Algorithm 1's first line: Z = α I_θ + σ ε. A denoiser that knows no better gives the renderings back."""
     start = torch.full(SHAPE, 0.4)

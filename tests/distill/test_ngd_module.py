@@ -61,7 +61,13 @@ TEACHERS = {
 
 
 def distillation(teacher, views=3, inner_steps=3, rays=64, lr_planes=1e-2, **more) -> Distillation:
-    options = {"lr_decoder": 1e-4, "lr_decay": "none", "fit_source": False, "views_at_once": 2} | more
+    options = {
+        "lr_decoder": 1e-4,
+        "lr_decay": "none",
+        "fit_source": False,
+        "source_tolerance": 10.0,
+        "views_at_once": 2,
+    } | more
     return Distillation("test", prior(views), teacher, inner_steps, rays, lr_planes, **options)
 
 

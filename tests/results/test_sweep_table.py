@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import logging
 import math
 
 import numpy as np
@@ -224,10 +223,9 @@ def test_a_failure_that_no_row_tells_of_becomes_one(tmp_path, monkeypatch):
     assert "disk full" in (tmp_path / "table.md").read_text()
 
 
-def test_a_sweep_without_any_success_says_so(tmp_path, caplog):
+def test_a_sweep_without_any_success_says_so_and_fails(tmp_path):
     callback = table()
     callback.on_multirun_start(sweep(tmp_path, {"strategy": "none", "seed": "0"}))
-    with caplog.at_level(logging.ERROR):
+    with pytest.raises(SystemExit, match="no job of this sweep succeeded"):
         callback.on_multirun_end(OmegaConf.create())
-    assert "no job of this sweep succeeded" in caplog.text
     assert "not run" in (tmp_path / "table.md").read_text() and not (tmp_path / "grid.png").exists()

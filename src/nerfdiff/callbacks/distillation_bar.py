@@ -18,4 +18,5 @@ class DistillationBar(Callback):
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs, batch, batch_idx: int) -> None:
         step = pl_module.trace[-1]
         where = f"step {batch_idx + 1}" if step.t is None else f"t {step.t:.2f}"
-        self.tell(f"{where}, renders against targets {step.agreement:.1f} dB")
+        agreement = "–" if step.agreement is None else f"{step.agreement:.1f} dB"
+        self.tell(f"{where}, renders against targets {agreement}")

@@ -1,4 +1,4 @@
-"""DDIM sampling (Song et al. 2020) in x0 form, with a hook where guidance acts."""
+"""DDIM sampling (Song et al. 2020) in x0 form."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfdiff.diffusion.schedule import alpha_sigma, eps_from_x0
+from nerfdiff.errors import ConfigError
 
 Images = Float[Tensor, "batch 3 height width"]
 
@@ -16,10 +17,10 @@ def time_steps(n: int, t_max: float, t_min: float, device=None) -> Float[Tensor,
     """n + 1 evenly spaced times from t_max down to t_min.
 
     Raises:
-        ValueError: not 0 <= t_min < t_max <= 1, or n < 1.
+        ConfigError: not 0 <= t_min < t_max <= 1, or n < 1.
     """
     if not 0 <= t_min < t_max <= 1 or n < 1:
-        raise ValueError(f"need 0 <= t_min < t_max <= 1 and n >= 1, got t_min={t_min}, t_max={t_max}, n={n}")
+        raise ConfigError(f"t_min={t_min}, t_max={t_max}, steps={n}: need 0 <= t_min < t_max <= 1 and steps >= 1")
     return torch.linspace(t_max, t_min, n + 1, dtype=torch.float64, device=device).float()
 
 
@@ -47,7 +48,6 @@ def ddim_sample(
     times: Float[Tensor, "times"],
     eta: float = 0.0,
     noise: Callable[[], Images] | None = None,
-    on_x0: Callable[[Images, Tensor], Images] | None = None,
 ) -> Images:
     """Follow the reverse process along `times` and return the last denoised images.
 
@@ -56,14 +56,11 @@ def ddim_sample(
         z: the noise at times[0].
         times: descending, one more than there are steps.
         noise: makes fresh standard normal images; needed where eta > 0.
-        on_x0: called with every (x0, t); what it returns takes x0's place: the hook for guidance and previews.
 
     Returns:
         x0 at the last step, which equals Z at times[-1] = 0.
     """
     for t, t_next in pairwise(times):
         x0 = denoise(z, t)
-        if on_x0 is not None:
-            x0 = on_x0(x0, t)
         z = ddim_step(z, x0, t, t_next, eta, noise() if eta > 0 else None)
     return x0

@@ -27,7 +27,7 @@ def sample_views(views: VirtualViews, steps: int, t_max: float, t_min: float, et
     """
     times = time_steps(steps, t_max, t_min, device=views.encoding.source.device)
     x0 = ddim_sample(lambda z, t: views.denoise(z, t.expand(len(z))), views.noise(), times, eta, views.noise)
-    return (0.5 * (x0 + 1)).clamp(0, 1)
+    return 0.5 * (x0 + 1)
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class IndependentViews:
         return Views(
             images=images,
             denoiser_calls=self.steps * len(images),
-            field_queries=model.renderer.samples_per_ray * images[:, 0].numel(),
+            field_queries=model.renderer.samples_per_ray * images[:, 0].numel(),  # the CDM's condition
         )
 
     @torch.no_grad()

@@ -1,11 +1,12 @@
 """Direct distillation: every view sampled once by itself, and the field fitted to what came out (paper, appendix)."""
 
 from nerfdiff.distill.cdm import sample_views
-from nerfdiff.distill.virtual_views import Images, VirtualViews
+from nerfdiff.distill.fixed_images import FixedImages
+from nerfdiff.distill.virtual_views import VirtualViews
 
 
-class SampledViews:
-    """The same samples of the CDM at every step.
+class SampledViews(FixedImages):
+    """Samples of the CDM.
 
     Args:
         views: to sample.
@@ -14,11 +15,5 @@ class SampledViews:
         eta: DDIM's η.
     """
 
-    t = weight = None
-
     def __init__(self, views: VirtualViews, steps: int, sampler_steps: int, t_max: float, t_min: float, eta: float):
-        self.steps = steps
-        self.images = sample_views(views, sampler_steps, t_max, t_min, eta)
-
-    def targets(self, step: int, rendered: Images) -> Images:
-        return self.images
+        super().__init__(sample_views(views, sampler_steps, t_max, t_min, eta), steps)

@@ -1,7 +1,8 @@
 """A field fine-tuned for one scene at test time, by any teacher, then rendered: strategies `ngd`, `direct`, `sds`."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -33,6 +34,7 @@ class Distillation:
         lr_planes, lr_decoder: learning rates of W and θ.
         lr_decay: of both, as the steps go by: `none`, `linear` or `cosine`.
         fit_source: whether the input image is fitted beside the virtual views.
+        source_tolerance: dB by which the input view may get worse before the scene falls back to its first field.
         views_at_once: views denoised in one batch, which bounds memory.
     """
 
@@ -45,21 +47,19 @@ class Distillation:
     lr_decoder: float
     lr_decay: str
     fit_source: bool
+    source_tolerance: float
     views_at_once: int
 
     def predict(self, model: NerfDiff, scene: ViewBatch, seed: int, callbacks: Sequence[Callback] = ()) -> Views:
         module = self.distil(model, scene, seed, callbacks)
         with torch.no_grad():
             rendering = module.field.render(model.renderer, scene.target_cameras)
-        samples = model.renderer.samples_per_ray
-        fitted = len(module.trace) * self.inner_steps * self.rays
-        watched = len(module.trace) * len(module.views) * rendering.opacity[0, 0].numel()
         return Views(
             images=rendering.rgb[0].movedim(-1, 1),
             opacity=rendering.opacity[0],
             depth=z_depth(rendering.depth[0], scene.target_cameras[0]),
             denoiser_calls=module.views.denoiser_calls,
-            field_queries=samples * (fitted + watched + rendering.opacity.numel()),
+            field_queries=module.views.field_queries + model.renderer.samples_per_ray * rendering.opacity.numel(),
             field=SavedField(module.field, model.renderer),
             trace=module.trace,
             status=module.status,
@@ -85,24 +85,35 @@ class Distillation:
             self.lr_decoder,
             self.lr_decay,
             self.fit_source,
+            self.source_tolerance,
             purpose,
         )
         device = scene.source.device
-        # one Trainer per scene: what it says once per training run would fill the log
-        logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-        trainer = Trainer(
-            max_epochs=1,
-            accelerator="cuda" if device.type == "cuda" else "cpu",
-            devices=[device.index or 0] if device.type == "cuda" else 1,
-            logger=False,
-            callbacks=list(callbacks),
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-        )
-        with torch.enable_grad():
+        with torch.enable_grad(), _hushed("lightning.pytorch"):
+            trainer = Trainer(
+                max_epochs=1,
+                accelerator="cuda" if device.type == "cuda" else "cpu",
+                devices=[device.index or 0] if device.type == "cuda" else 1,
+                logger=False,
+                callbacks=list(callbacks),
+                enable_checkpointing=False,
+                enable_progress_bar=False,
+                enable_model_summary=False,
+            )
             trainer.fit(module)
         module.to(device)
         if module.status != "ok":
             log.warning("%s of scene %s fell back: %s", self.name, scene.scene_ids[0], module.status)
         return module
+
+
+@contextmanager
+def _hushed(name: str) -> Iterator[None]:
+    """Without what a logger says once per training run: there is one Trainer per scene."""
+    logger = logging.getLogger(name)
+    level = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)

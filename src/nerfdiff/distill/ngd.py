@@ -21,6 +21,8 @@ class GuidedViews:
         ConfigError: another `condition`.
     """
 
+    follows_field = True
+
     def __init__(
         self,
         views: VirtualViews,
@@ -43,7 +45,7 @@ class GuidedViews:
     def targets(self, step: int, rendered: Images) -> Images:
         t, t_next = self.times[step], self.times[step + 1]
         x0 = self.views.denoise(self._z, t.expand(len(self._z)), rendered if self.on_current else None)
-        self._last = self.guidance(x0, 2 * rendered - 1, self._last, t).clamp(-1, 1)
+        self._last = self.guidance(x0, 2 * rendered - 1, self._last, t)
         self.t, self.weight = float(t), float(self.guidance.weight(t))
         self._z = ddim_step(self._z, self._last, t, t_next, self.eta, self.views.noise() if self.eta > 0 else None)
         return 0.5 * (self._last + 1)

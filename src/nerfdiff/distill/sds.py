@@ -3,6 +3,7 @@
 from nerfdiff.diffusion.schedule import add_noise, alpha_sigma, expand
 from nerfdiff.distill.teacher import sees_current
 from nerfdiff.distill.virtual_views import Images, VirtualViews
+from nerfdiff.errors import ConfigError
 
 
 class DenoisedRenderings:
@@ -15,12 +16,15 @@ class DenoisedRenderings:
         condition: the rendering that the CDM sees: the `first` or the `current` one.
 
     Raises:
-        ConfigError: another `condition`.
+        ConfigError: another `condition`, or times or steps that cannot be.
     """
 
     t = weight = None
+    follows_field = True
 
     def __init__(self, views: VirtualViews, steps: int, t_max: float, t_min: float, condition: str):
+        if not 0 <= t_min <= t_max <= 1 or steps < 1:
+            raise ConfigError(f"t_min={t_min}, t_max={t_max}, steps={steps}: need 0 <= t_min <= t_max <= 1, steps >= 1")
         self.views, self.steps = views, steps
         self.t_max, self.t_min = t_max, t_min
         self.on_current = sees_current(condition)
@@ -30,4 +34,4 @@ class DenoisedRenderings:
         alpha, sigma = (expand(c, rendered) for c in alpha_sigma(t))
         z = add_noise(2 * rendered - 1, self.views.noise(), alpha, sigma)
         x0 = self.views.denoise(z, t, rendered if self.on_current else None)
-        return (0.5 * (x0 + 1)).clamp(0, 1)
+        return 0.5 * (x0 + 1)

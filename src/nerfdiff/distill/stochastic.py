@@ -6,12 +6,13 @@ import torch
 
 from nerfdiff.diffusion.ddim import ddim_step, time_steps
 from nerfdiff.diffusion.denoiser import Condition
-from nerfdiff.distill.virtual_views import Images, VirtualViews
+from nerfdiff.distill.fixed_images import FixedImages
+from nerfdiff.distill.virtual_views import VirtualViews
 from nerfdiff.field.encoder import Encoding
 from nerfdiff.randomness import generator
 
 
-class AutoregressiveViews:
+class AutoregressiveViews(FixedImages):
     """Views made one after another; each diffusion step is conditioned on one of those there are already.
 
     3DiM's network takes a conditioning image and the relative pose. Ours takes a rendering and an encoder's features;
@@ -26,11 +27,8 @@ class AutoregressiveViews:
         eta: DDIM's η.
     """
 
-    t = weight = None
-
     @torch.no_grad()
     def __init__(self, views: VirtualViews, steps: int, sampler_steps: int, t_max: float, t_min: float, eta: float):
-        self.steps = steps
         model, encodings = views.model, [views.encoding]
         frustum = views.encoding.triplane
         choice = generator("cpu", *views.seed, "stochastic conditioning")
@@ -43,15 +41,13 @@ class AutoregressiveViews:
                 known = int(torch.randint(len(encodings), (), generator=choice))
                 if known not in conditions:
                     conditions[known] = _condition(views, encodings[known], known, view)
-                x0 = model.denoiser(z, t[None], conditions[known])
+                    views.field_queries += model.renderer.samples_per_ray * z[0, 0].numel()
+                x0 = model.denoiser(z, t[None], conditions[known]).clamp(-1, 1)
                 views.denoiser_calls += 1
                 z = ddim_step(z, x0, t, t_next, eta, views.noise_of(view)[None] if eta > 0 else None)
-            images.append((0.5 * (x0 + 1)).clamp(0, 1))
+            images.append(0.5 * (x0 + 1))
             encodings.append(model.encode(images[-1], frustum.cameras, frustum.near, frustum.far))
-        self.images = torch.cat(images)
-
-    def targets(self, step: int, rendered: Images) -> Images:
-        return self.images
+        super().__init__(torch.cat(images), steps)
 
 
 def _condition(views: VirtualViews, encoding: Encoding, known: int, view: int) -> Condition:

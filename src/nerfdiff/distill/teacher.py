@@ -14,18 +14,21 @@ class Teacher(Protocol):
     steps: int
     """How many times targets are asked for."""
 
+    follows_field: bool
+    """Whether targets depend on the field's renderings, which are made for that only."""
+
     t: float | None
     """Time of the last step, where all views share one."""
 
     weight: float | None
     """Of guidance at the last step, where there is one."""
 
-    def targets(self, step: int, rendered: Images) -> Images:
+    def targets(self, step: int, rendered: Images | None) -> Images:
         """Images in [0, 1] to fit the field to.
 
         Args:
             step: from 0 to `steps` - 1, each once, in order.
-            rendered: the field's images of all views now, in [0, 1].
+            rendered: the field's images of all views now, in [0, 1]; None where the teacher does not follow the field.
         """
 
 

@@ -19,14 +19,15 @@ class Step:
         t: diffusion time, where all views share one.
         weight: of guidance, where there is any.
         loss_first, loss_last: mean squared error of the rays of the first and the last inner step, if there are any.
-        agreement: PSNR of the field's renderings against the targets before they were fitted, in dB.
+        agreement: PSNR of the field's renderings against the targets before they were fitted, in dB: of all pixels
+            where the method renders them, else of the first inner step's rays; None if there are none.
     """
 
     t: float | None
     weight: float | None
     loss_first: float | None
     loss_last: float | None
-    agreement: float
+    agreement: float | None
 
 
 def write_trace(path: Path, trace: Sequence[Step]) -> None:

@@ -38,6 +38,7 @@ class VirtualViews:
             self._conditions.append(model.condition(encoding, chunk, model.render(encoding, chunk)))
         self._noise = [generator(encoding.source.device, *seed, view) for view in range(len(self))]
         self.denoiser_calls = 0
+        self.field_queries = model.renderer.samples_per_ray * self.first_renderings[:, 0].numel()
 
     def __len__(self) -> int:
         return self.cameras.shape[1]
@@ -49,7 +50,7 @@ class VirtualViews:
 
     @torch.no_grad()
     def denoise(self, z: Images, t: Float[Tensor, "views"], rendered: Images | None = None) -> Images:
-        """x0 in [-1, 1] of every view.
+        """x0 of every view, clamped to [-1, 1] as images are.
 
         Args:
             t: of each view.
@@ -61,7 +62,7 @@ class VirtualViews:
             if rendered is not None:
                 condition = replace(condition, rendered=rendered[part])
             x0.append(self.model.denoiser(z[part], t[part], condition))
-        return torch.cat(x0)
+        return torch.cat(x0).clamp(-1, 1)
 
     def noise(self) -> Images:
         """Fresh standard normal images, each from its own view's stream."""

@@ -1,12 +1,14 @@
 """One strategy over the scenes of a dataset, or over one picture, on one or several processes."""
 
 import logging
+from datetime import timedelta
 
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from hydra.utils import instantiate
 from lightning import Fabric
+from lightning.fabric.strategies import DDPStrategy
 from omegaconf import DictConfig
 
 from nerfdiff.distill.strategy import Strategy
@@ -39,7 +41,7 @@ def distill(cfg: DictConfig) -> ResultRow | None:
     try:
         fabric = _launch(cfg)
         subject = picture_subject(cfg, fabric.device) if cfg.image else dataset_subject(cfg, fabric.device)
-        strategy, scorer = instantiate(cfg.strategy), instantiate(cfg.metrics)
+        strategy, scorer = _strategy(cfg), instantiate(cfg.metrics)
         _predict_together(fabric, subject, strategy)
         if fabric.global_rank > 0:
             return None
@@ -58,6 +60,12 @@ def distill(cfg: DictConfig) -> ResultRow | None:
         show([row], subject.folder / "table.md")
     log.info("fields, traces and orbits: %s", subject.predictions / strategy.name)
     return row
+
+
+def _strategy(cfg: DictConfig) -> Strategy:
+    """`cfg.strategy`; for a picture with the views that it is to be seen from as Π, no dataset's."""
+    prior = {"prior": cfg.picture_views} if cfg.image and "prior" in cfg.strategy else {}
+    return instantiate(cfg.strategy, **prior)
 
 
 def _rank() -> int:
@@ -83,7 +91,9 @@ def _launch(cfg: DictConfig) -> Fabric:
     if many and device.index is not None:
         raise ConfigError(f"device={cfg.device} is one device: say device={device.type} with processes={cfg.processes}")
     devices = [device.index or 0] if device.type == "cuda" and not many else cfg.processes
-    fabric = Fabric(accelerator=device.type, devices=devices, strategy="ddp" if many else "auto")
+    # Processes meet when all are done, however long the longest takes.
+    strategy = DDPStrategy(timeout=timedelta(days=30)) if many else "auto"
+    fabric = Fabric(accelerator=device.type, devices=devices, strategy=strategy)
     fabric.launch()
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
@@ -91,14 +101,21 @@ def _launch(cfg: DictConfig) -> Fabric:
 
 
 def _predict_together(fabric: Fabric, subject: Subject, strategy: Strategy) -> None:
-    """Each process its share; if one of them fails all end, instead of waiting for it."""
+    """Each process its share; where one fails the others still finish theirs, and all then fail with its words."""
     failure: Exception | None = None
     try:
         predict(subject, strategy, fabric.global_rank, fabric.world_size)
     except Exception as error:
+        if fabric.world_size == 1:
+            raise
+        log.exception("process %d failed", fabric.global_rank)
         failure = error
-    failed = fabric.all_reduce(torch.tensor(float(failure is not None), device=fabric.device), reduce_op="sum")
+    if fabric.world_size == 1:
+        return
+    words: list[str | None] = [None] * fabric.world_size
+    torch.distributed.all_gather_object(words, failure and f"{type(failure).__name__}: {failure}")
     if failure is not None:
         raise failure
-    if failed > 0:
-        raise RuntimeError(f"{int(failed)} of {fabric.world_size} processes failed; their messages are above")
+    for rank, said in enumerate(words):
+        if said is not None:
+            raise RuntimeError(f"process {rank} of {fabric.world_size} failed ({said})")

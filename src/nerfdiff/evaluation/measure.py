@@ -2,7 +2,6 @@
 
 import logging
 import os
-import resource
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -87,7 +86,7 @@ def _cost(subject: Subject, strategy: Strategy) -> dict[str, Any]:
     }
     if fields["field_queries"] == 0:
         return fields  # a baseline: no model ran
-    fields |= _model_timings(subject) | {"peak_mem_bytes": _peak_memory(subject.device)}
+    fields |= _model_timings(subject) | {"peak_mem_bytes": max(cost["peak_mem_bytes"] for cost in scenes)}
     fields["params"] = subject.model.parameter_count()["total"]
     if fields["denoiser_calls"]:
         # The first scene warms up, unless it is the only one.
@@ -113,10 +112,3 @@ def _model_timings(subject: Subject) -> dict[str, Any]:
             "encode_s": time_calls(lambda: model.encode(*inputs), **repeats),
             "render_s": time_calls(lambda: model.render(encoding, camera), **repeats),
         }
-
-
-def _peak_memory(device: torch.device) -> int:
-    """Bytes: allocated on a GPU; on a CPU the process's resident set, everything it imports included."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -1,6 +1,7 @@
 """Scene after scene: predictions, and what is left beside them."""
 
 import json
+import resource
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,7 +32,7 @@ ORBIT = "orbit.mp4"
 def predict(subject: Subject, strategy: Strategy, rank: int = 0, processes: int = 1) -> None:
     """Predict what is still to do of one process's share; a killed run loses at most the scene in hand."""
     writer = _writer(subject, strategy)
-    pending = writer.pending()[rank::processes]
+    pending = [scene for scene in writer.scenes[rank::processes] if scene in writer.pending()]
     if subject.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(subject.device)
     with Progress(
@@ -67,19 +68,22 @@ def _predict_scene(
         opacity=views.opacity,
         cost={
             "seconds": watch.seconds[0],
+            "peak_mem_bytes": _peak_memory(subject.device),
             "denoiser_calls": views.denoiser_calls,
             "field_queries": views.field_queries,
         },
         status=views.status,
-        beside=partial(_leave, subject, strategy, scene, views) if subject.cfg.per_scene else None,
+        beside=partial(_leave, subject, strategy, scene, views),
     )
     return psnr(views.images.clamp(0, 1), scene.targets[0]).mean().item() if subject.data else None
 
 
 def _leave(subject: Subject, strategy: Strategy, scene: ViewBatch, views: Views, folder: Path) -> None:
-    """The field, its trace and an orbit in the scene's folder."""
-    if views.field is not None:
+    """The field, its trace and an orbit in the scene's folder; a field that was fitted in any case."""
+    if views.field is not None and (views.trace or subject.cfg.per_scene):
         save_field(folder / FIELD, views.field)
+    if not subject.cfg.per_scene:
+        return
     if views.trace:
         write_trace(folder / TRACE, views.trace)
         plot_trace(folder / PLOT, views.trace)
@@ -111,6 +115,13 @@ def costs(subject: Subject, strategy: Strategy) -> list[dict[str, Any]]:
     folder = _writer(subject, strategy).folder
     facts = [json.loads((folder / scene / SCENE).read_text()) for scene in subject.scene_ids]
     return [fact["cost"] | {"status": fact["status"]} for fact in facts]
+
+
+def _peak_memory(device: torch.device) -> int:
+    """Bytes so far: allocated on a GPU; on a CPU the process's resident set, everything it imports included."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 def _writer(subject: Subject, strategy: Strategy) -> PredictionWriter:

@@ -51,7 +51,8 @@ class Subject:
         """bf16 products where the precision asks for them."""
         if self.precision == "32-true":
             return nullcontext()
-        return torch.autocast(self.device.type, torch.bfloat16)
+        # Without the cache: it would keep the first bf16 copy of parameters that a strategy fits.
+        return torch.autocast(self.device.type, torch.bfloat16, cache_enabled=False)
 
 
 def choose_device(name: str) -> torch.device:
@@ -98,6 +99,7 @@ def dataset_subject(cfg: DictConfig, device: torch.device) -> Subject:
     facts = {
         "split_sha256": sha256_values(scene_ids),
         "files_sha256": reader.fingerprint(),
+        "reader": reader.identity,
         "views": [cfg.data.source_view, cfg.data.eval_stride],
         "image_size": size,
         "mean_image_scenes": cfg.get("mean_image_scenes"),  # of a baseline that only evaluate.py has
@@ -106,7 +108,7 @@ def dataset_subject(cfg: DictConfig, device: torch.device) -> Subject:
 
 
 def picture_subject(cfg: DictConfig, device: torch.device) -> Subject:
-    """The scene on the picture `cfg.image`, to be seen from `cfg.shown_views`.
+    """The scene on the picture `cfg.image`, to be seen from `cfg.picture_views`.
 
     Raises:
         UserError: bad picture, config or checkpoint.
@@ -117,14 +119,14 @@ def picture_subject(cfg: DictConfig, device: torch.device) -> Subject:
         raise ConfigError(f"{loaded.path} does not say what image size it is for: give picture_size=[height,width]")
     picture = instantiate(cfg.picture)
     scene = picture.load(cfg.image, tuple(size))
-    cameras = instantiate(cfg.shown_views)(scene)
+    cameras = instantiate(cfg.picture_views)(scene)
     blank = scene.source_pixels[:, None].expand(-1, cameras.shape[1], -1, -1, -1)
     names = tuple(f"{view:03d}" for view in range(cameras.shape[1]))
     scene = replace(scene, target_cameras=cameras, target_pixels=blank, target_views=(names,))
     facts = {
         "files_sha256": [sha256_file(file) for file in (cfg.image, cfg.picture.mask) if file],
         "picture": plain(cfg.picture),
-        "shown_views": plain(cfg.shown_views),
+        "picture_views": plain(cfg.picture_views),
         "image_size": list(size),
     }
     return _subject(cfg, device, loaded, lambda names: [scene] * len(names), list(scene.scene_ids), facts, None)
@@ -147,6 +149,8 @@ def _subject(
         "weights": loaded.weights,
         "seed": cfg.seed,
         "precision": precision,
+        "device": device.type,  # whose generators draw the noise
+        "orbit": cfg.per_scene and cfg.orbit.frames,
         "strategy": plain(cfg.strategy),
     }
     folder = Path(cfg.paths.output_dir) / f"{cfg.strategy.name}-{sha256_values(identity)[:8]}"

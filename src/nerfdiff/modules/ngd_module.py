@@ -38,10 +38,11 @@ class NGDModule(LightningModule):
         lr_planes, lr_decoder: learning rates of W and θ.
         lr_decay: of both, over the teacher's steps: `none`, `linear` or `cosine`.
         fit_source: whether the input image, the one view that is known, is fitted beside the virtual views.
+        source_tolerance: dB by which the input view may get worse before the scene falls back to its first field.
         seed: of the rays.
 
     Raises:
-        ConfigError: another `lr_decay`.
+        ConfigError: another `lr_decay`, no rays, or negative steps.
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class NGDModule(LightningModule):
         lr_decoder: float,
         lr_decay: str,
         fit_source: bool,
+        source_tolerance: float,
         seed: tuple[int | str, ...],
     ):
         super().__init__()
@@ -62,10 +64,12 @@ class NGDModule(LightningModule):
         self.field = field
         self.views, self.teacher = views, teacher
         self.inner_steps, self.rays = inner_steps, rays
+        if rays < 1 or inner_steps < 0:
+            raise ConfigError(f"rays={rays} must be at least 1 and inner_steps={inner_steps} at least 0")
         if lr_decay not in DECAYS:
             raise ConfigError(f"strategy.lr_decay={lr_decay!r}: choose {', '.join(DECAYS)}")
         self.lr_planes, self.lr_decoder, self.lr_decay = lr_planes, lr_decoder, lr_decay
-        self.fit_source = fit_source
+        self.fit_source, self.source_tolerance = fit_source, source_tolerance
         self.seed = seed
         self.trace: list[Step] = []
         self.status = "ok"
@@ -90,29 +94,37 @@ class NGDModule(LightningModule):
         self._generator = generator(self.device, *self.seed, "rays")
 
     def training_step(self, step: int, batch_idx: int) -> None:
-        rendered = self._renderings()
+        rendered = self._render(self.views.cameras) if self.teacher.follows_field else None
         targets = self.teacher.targets(step, rendered)
         losses = self._fit(targets)
-        self.lr_schedulers().step()
-        agreement = -10 * torch.log10(F.mse_loss(rendered, targets) + 1e-6)
+        if self.inner_steps > 0:
+            self.lr_schedulers().step()
         first, last = (float(losses[0]), float(losses[-1])) if len(losses) else (None, None)
-        self.trace.append(Step(self.teacher.t, self.teacher.weight, first, last, float(agreement)))
+        distance = first if rendered is None else float(F.mse_loss(rendered, targets))
+        agreement = None if distance is None else -10 * math.log10(distance + 1e-6)
+        self.trace.append(Step(self.teacher.t, self.teacher.weight, first, last, agreement))
         if bool(torch.isfinite(losses).all()) and self.field.is_finite():
             self._good, self._last_targets = self.field.snapshot(), targets
         else:
             self._fall_back("non-finite", self._good)
 
     def on_train_end(self) -> None:
-        """A field that explains the last targets worse than the one it began as has been harmed: back to that one."""
+        """Back to the field it began as, if it has been harmed.
+
+        It has if it explains the last targets worse than the one it began as, or, as those may have followed it
+        astray, the input view much worse.
+        """
         if self.status != "ok" or self.inner_steps == 0:
             return
-        refined = self._distance()
+        refined = self._distances()
         after = self.field.snapshot()
         self.field.load_state_dict(self._start)
-        if not refined <= self._distance():
-            self._fall_back("diverged", self._start)
-        else:
+        began = self._distances()
+        tolerated = 10 ** (self.source_tolerance / 10)
+        if refined[0] <= began[0] and refined[1] <= tolerated * began[1] + 1e-6:
             self.field.load_state_dict(after)
+        else:
+            self._fall_back("diverged", self._start)
 
     def _fit(self, targets: Images) -> Tensor:
         """N inner steps; their losses."""
@@ -130,14 +142,23 @@ class NGDModule(LightningModule):
             self.manual_backward(loss)
             optimizer.step()
             losses.append(loss.detach())
+        self.views.field_queries += renderer.samples_per_ray * self.inner_steps * self.rays
         return torch.stack(losses) if losses else targets.new_zeros(0)
 
     @torch.no_grad()
-    def _renderings(self) -> Images:
-        return self.field.render(self.views.model.renderer, self.views.cameras).rgb[0].movedim(-1, 1)
+    def _render(self, cameras: Cameras) -> Images:
+        renderer = self.views.model.renderer
+        images = self.field.render(renderer, cameras).rgb[0].movedim(-1, 1)
+        self.views.field_queries += renderer.samples_per_ray * images[:, 0].numel()
+        return images
 
-    def _distance(self) -> float:
-        return float(F.mse_loss(self._renderings(), self._last_targets))
+    def _distances(self) -> tuple[float, float]:
+        """Mean squared errors of the last targets and of the input view."""
+        source = self._render(self.field.cameras[None])
+        return (
+            float(F.mse_loss(self._render(self.views.cameras), self._last_targets)),
+            float(F.mse_loss(source, self.views.encoding.source)),
+        )
 
     def _fall_back(self, status: str, state: dict[str, Tensor]) -> None:
         self.field.load_state_dict(state)

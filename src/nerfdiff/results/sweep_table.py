@@ -24,8 +24,6 @@ from nerfdiff.results.sweep_text import to_csv, to_markdown, to_rich
 
 log = logging.getLogger(__name__)
 
-VIDEO_SCENES = 3
-
 
 class SweepTable(Callback):
     """Writes table.csv and table.md into the sweep's folder after every job, and grid.png and orbits.mp4 at the end.
@@ -91,11 +89,11 @@ class SweepTable(Callback):
         console = Console(width=None if sys.stdout.isatty() else 200)
         console.print(to_rich(lines))
         if not any(line.seeds for line in lines):
-            log.error("no job of this sweep succeeded; %s says why", folder / "table.md")
-            return
+            # Hydra lets no Exception of a callback end the command
+            raise SystemExit(f"error: no job of this sweep succeeded; {folder / 'table.md'} says why")
         pictures = [
             grid(folder / "grid.png", self.sweep, groups),
-            orbits(folder / "orbits.mp4", groups, VIDEO_SCENES, self.sweep.orbit.fps),
+            orbits(folder / "orbits.mp4", groups, self.sweep.orbit),
         ]
         left = ", ".join(str(picture) for picture in pictures if picture)
         log.info("table: %s and .csv   pictures: %s", folder / "table.md", left or "none")

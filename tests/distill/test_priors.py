@@ -1,10 +1,13 @@
 """Priors against cameras whose places are known, in worlds that the priors never see."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from nerfdiff.cameras import Cameras
+from nerfdiff.cli import load_config
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.priors.circle import Circle, plane_normal
 from nerfdiff.distill.priors.own_views import OwnViews
@@ -13,6 +16,9 @@ from nerfdiff.distill.priors.sphere import Sphere
 from nerfdiff.distill.priors.srn_spiral import SRNSpiral
 from nerfdiff.errors import ConfigError, DataError
 from nerfdiff.orbit import look_at_point
+from nerfdiff.scenes.kinds.clevr3d import Clevr3DScenes
+from nerfdiff.scenes.kinds.kind import SceneJob
+from nerfdiff.scenes.poses import look_at_origin
 
 K = torch.tensor([[20.0, 0, 9.0], [0, 20.0, 7.0], [0, 0, 1]])
 
@@ -135,3 +141,24 @@ def test_part_of_the_sphere_stays_on_the_inputs_side():
 def test_all_are_priors():
     for prior in (SRNSpiral(5, 64), OwnViews(5), Circle(5), Sphere(5, (0.0, 1.0), (0.0, 1.0), 0.0)):
         assert isinstance(prior, Prior)
+
+
+def test_on_generated_clevr3d_scenes_centre_up_and_radius_are_the_truth_s():
+    """The twin's cameras differ in distance as Clevr3D's do, so the plane through them leans a little.
+
+    Stated errors, over 20 scenes: the centre is exact to 1e-5 of the radius, up is within 5°, the radius within half a percent.
+    """
+    kind = Clevr3DScenes.from_config(load_config("make_scenes", ["scenes=clevr3d", "resolution=30"]))
+    for index in range(20):
+        centres = kind.centres(SceneJob(Path("."), split="scenes", index=index, views=3))
+        world = [look_at_origin(centre) for centre in centres]
+        batch = scene(world, near=4.0, far=20.0)
+        to_source = np.linalg.inv(world[0])
+        radius = np.linalg.norm(centres, axis=1).mean()
+        cameras = all_cameras(batch)
+        centre = look_at_point(cameras).double().numpy()
+        np.testing.assert_allclose(centre, to_source[:3, 3], atol=1e-5 * radius)
+        up = plane_normal(cameras).double().numpy() @ to_source[:3, 2]
+        assert np.degrees(np.arccos(up)) < 5
+        distances = np.linalg.norm(Circle(50)(batch).centres[0].double().numpy() - centre, axis=1)
+        np.testing.assert_allclose(distances, radius, rtol=0.005)

@@ -19,6 +19,7 @@ from nerfdiff.evaluation.pictures import sheet
 from nerfdiff.evaluation.predict import predict
 from nerfdiff.evaluation.subject import Subject, choose_device, dataset_subject, picture_subject
 from nerfdiff.results.row import ResultRow
+from nerfdiff.training import plain
 
 log = logging.getLogger(__name__)
 
@@ -64,8 +65,10 @@ def distill(cfg: DictConfig) -> ResultRow | None:
 
 def _strategy(cfg: DictConfig) -> Strategy:
     """`cfg.strategy`; for a picture with the views that it is to be seen from as Π, no dataset's."""
-    prior = {"prior": cfg.picture_views} if cfg.image and "prior" in cfg.strategy else {}
-    return instantiate(cfg.strategy, **prior)
+    settings = plain(cfg.strategy)
+    if cfg.image and "prior" in settings:
+        settings["prior"] = plain(cfg.picture_views)
+    return instantiate(settings)
 
 
 def _rank() -> int:

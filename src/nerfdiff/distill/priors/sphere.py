@@ -1,6 +1,7 @@
 """Π for any picture: cameras on a sphere around what the input camera looks at."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -30,8 +31,8 @@ class Sphere:
     """
 
     views: int
-    elevation: tuple[float, float]
-    azimuth: tuple[float, float]
+    elevation: Sequence[float]
+    azimuth: Sequence[float]
     source_elevation: float
 
     def __post_init__(self):

@@ -105,11 +105,11 @@ def test_the_same_evaluation_predicts_nothing_twice(data, run, tmp_path, monkeyp
 def test_a_killed_evaluation_goes_on_at_the_next_scene(data, run, tmp_path, monkeypatch):
     predict, calls = SingleImageNeRF.predict, []
 
-    def fail_at_the_second(self, model, scene, seed):
+    def fail_at_the_second(self, model, scene, *more):
         calls.append(scene.scene_ids[0])
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return predict(self, model, scene, seed)
+        return predict(self, model, scene, *more)
 
     monkeypatch.setattr(SingleImageNeRF, "predict", fail_at_the_second)
     settings = config(data, run, tmp_path, "orbit.scenes=0")
@@ -123,8 +123,8 @@ def test_a_killed_evaluation_goes_on_at_the_next_scene(data, run, tmp_path, monk
 def test_a_failure_is_a_row(data, run, tmp_path, monkeypatch):
     predict = SingleImageNeRF.predict
 
-    def broken(self, model, scene, seed):
-        views = predict(self, model, scene, seed)
+    def broken(self, *arguments):
+        views = predict(self, *arguments)
         views.images[0, 0, 0, 0] = float("nan")
         return views
 

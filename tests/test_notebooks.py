@@ -16,7 +16,7 @@ NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 METHODS = ("single-image NeRF", "CDM", "refined field")
 SMALL = """
 out = {out!r}
-strategy = ["strategy=ngd", "strategy.lr_planes=1.0e-3"]
+strategy = ["strategy=ngd_current", "strategy.lr_planes=1.0e-2"]
 budget = {{"steps": 2, "sampler_steps": 4, "inner_steps": 3, "rays": 64, "views": 3}}
 seed = 0
 """

@@ -146,7 +146,7 @@ def test_all_are_priors():
 def test_on_generated_clevr3d_scenes_centre_up_and_radius_are_the_truth_s():
     """The twin's cameras differ in distance as Clevr3D's do, so the plane through them leans a little.
 
-    Stated errors, over 20 scenes: the centre is exact to 1e-5 of the radius, up is within 5°, the radius within half a percent.
+    Stated errors, over 20 scenes: the centre is exact to 1e-5 of the radius, up is within 5°, the radius within 0.5 %.
     """
     kind = Clevr3DScenes.from_config(load_config("make_scenes", ["scenes=clevr3d", "resolution=30"]))
     for index in range(20):

@@ -50,9 +50,8 @@ def test_choices_replace_keys_that_there_are_and_keep_the_others(name, key):
     before = OmegaConf.select(composed("strategy=ngd"), key)
     values = [parser.parse_overrides([f"{key}={choice}"])[0].value() for choice in choices]
     after = [raw(OmegaConf.merge(raw(before), value)) for value in values]
-    assert (
-        raw(OmegaConf.select(composed("strategy=ngd", f"{key}={choices[-1]}"), key)) == after[-1]
-    )  # Hydra merges as well
+    merged = OmegaConf.select(composed("strategy=ngd", f"{key}={choices[-1]}"), key)
+    assert raw(merged) == after[-1]  # Hydra merges as well
     assert all(found.keys() == raw(before).keys() for found in after)
     assert len({str(found) for found in after}) == len(choices)
 

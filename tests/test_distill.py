@@ -22,7 +22,7 @@ from nerfdiff.evaluation.subject import dataset_subject
 from nerfdiff.metrics.predictions import read_prediction
 from nerfdiff.modules.ngd_module import NGDModule
 from nerfdiff.results.row import read_rows
-from training_fixtures import SRC, environment, run_training, write_dataset
+from training_fixtures import SRC, environment, evaluation_overrides, train_to_evaluate, write_dataset
 
 STEPS = 3
 
@@ -35,20 +35,17 @@ def data(tmp_path_factory):
 @pytest.fixture(scope="module")
 def run(data, tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    run_training(data, folder, "trainer.max_steps=2", "data.image_size=[20,28]")
+    train_to_evaluate(data, folder)
     return folder
 
 
 def overrides(data, run, out, *more) -> list[str]:
     if not any(word.startswith("strategy=") for word in more):
         more = ("strategy=ngd", *more)
-    return [
-        f"ckpt={run}",
-        f"data.root={data}",
-        "data.cache=false",
-        "data.image_size=[20,28]",
-        "data.source_view=0",
-        "data.num_workers=0",
+    return evaluation_overrides(
+        data,
+        run,
+        out,
         "budget=minutes",
         f"budget.steps={STEPS}",
         f"budget.sampler_steps={STEPS}",
@@ -59,10 +56,8 @@ def overrides(data, run, out, *more) -> list[str]:
         "timing.repeats=1",
         "timing.warmup=0",
         "metrics.st_lpips=false",
-        f"paths.output_dir={out}",
-        "threads=1",
         *more,
-    ]
+    )
 
 
 def config(*arguments):

@@ -10,7 +10,7 @@ from nerfdiff.errors import CheckpointError, ConfigError, DataError
 from nerfdiff.evaluation.evaluate import evaluate
 from nerfdiff.metrics.predictions import NonFinitePrediction
 from nerfdiff.results.row import read_rows
-from training_fixtures import run_training, write_dataset
+from training_fixtures import evaluation_overrides, train_to_evaluate, write_dataset
 
 
 @pytest.fixture(scope="module")
@@ -21,25 +21,20 @@ def data(tmp_path_factory):
 @pytest.fixture(scope="module")
 def run(data, tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    run_training(data, folder, "trainer.max_steps=2", "data.image_size=[20,28]")
+    train_to_evaluate(data, folder)
     return folder
 
 
 def config(data, run, out, *more):
-    overrides = [
-        f"ckpt={run}",
-        f"data.root={data}",
-        "data.cache=false",
-        "data.image_size=[20,28]",
-        "data.source_view=0",
-        "data.num_workers=0",
+    overrides = evaluation_overrides(
+        data,
+        run,
+        out,
         "orbit.frames=4",
         "timing.repeats=2",
         "timing.warmup=1",
-        f"paths.output_dir={out}",
-        "threads=1",
         *more,
-    ]
+    )
     return load_config("evaluate", overrides)
 
 

@@ -64,6 +64,26 @@ def command(data: Path, run: Path, *more: str) -> list[str]:
     return [sys.executable, str(SRC / "train.py"), *overrides(data, run, *more)]
 
 
+def train_to_evaluate(data: Path, run: Path) -> None:
+    """A checkpoint for `evaluation_overrides`."""
+    run_training(data, run, "trainer.max_steps=2", "data.image_size=[20,28]")
+
+
+def evaluation_overrides(data: Path, run: Path, out: Path, *more: str) -> list[str]:
+    """What evaluate.py and distill.py share in tests, on a checkpoint of `train_to_evaluate`."""
+    return [
+        f"ckpt={run}",
+        f"data.root={data}",
+        "data.cache=false",
+        "data.image_size=[20,28]",
+        "data.source_view=0",
+        "data.num_workers=0",
+        f"paths.output_dir={out}",
+        "threads=1",
+        *more,
+    ]
+
+
 def run_command(data: Path, run: Path, *more: str) -> subprocess.CompletedProcess:
     done = subprocess.run(command(data, run, *more), capture_output=True, text=True, env=environment(), timeout=300)
     assert done.returncode == 0, done.stderr[-3000:]

@@ -15,7 +15,6 @@ from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.distill.strategy import Views
 from nerfdiff.distill.teacher import MakeTeacher
 from nerfdiff.distill.virtual_views import VirtualViews
-from nerfdiff.metrics.depth import z_depth
 from nerfdiff.model import NerfDiff
 from nerfdiff.modules.ngd_module import NGDModule
 
@@ -52,17 +51,13 @@ class Distillation:
 
     def predict(self, model: NerfDiff, scene: ViewBatch, seed: int, callbacks: Sequence[Callback] = ()) -> Views:
         module = self.distil(model, scene, seed, callbacks)
-        with torch.no_grad():
-            rendering = module.field.render(model.renderer, scene.target_cameras)
-        return Views(
-            images=rendering.rgb[0].movedim(-1, 1),
-            opacity=rendering.opacity[0],
-            depth=z_depth(rendering.depth[0], scene.target_cameras[0]),
-            denoiser_calls=module.views.denoiser_calls,
-            field_queries=module.views.field_queries + model.renderer.samples_per_ray * rendering.opacity.numel(),
-            field=SavedField(module.field, model.renderer),
-            trace=module.trace,
-            status=module.status,
+        return Views.of_field(
+            SavedField(module.field, model.renderer),
+            scene.target_cameras,
+            module.views.denoiser_calls,
+            module.views.field_queries,
+            module.trace,
+            module.status,
         )
 
     def distil(self, model: NerfDiff, scene: ViewBatch, seed: int, callbacks: Sequence[Callback] = ()) -> NGDModule:

@@ -10,7 +10,6 @@ from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.field_file import SavedField
 from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.distill.strategy import Views
-from nerfdiff.metrics.depth import z_depth
 from nerfdiff.model import NerfDiff
 
 
@@ -23,11 +22,5 @@ class SingleImageNeRF:
     @torch.no_grad()
     def predict(self, model: NerfDiff, scene: ViewBatch, seed: int, callbacks: Sequence[Callback] = ()) -> Views:
         encoding = model.encode(scene.source, scene.source_cameras, scene.near, scene.far)
-        rendering = model.render(encoding, scene.target_cameras)
-        return Views(
-            images=rendering.rgb[0].movedim(-1, 1),
-            opacity=rendering.opacity[0],
-            depth=z_depth(rendering.depth[0], scene.target_cameras[0]),
-            field_queries=model.renderer.samples_per_ray * rendering.opacity.numel(),
-            field=SavedField(RefinedField(encoding.triplane, model.decoder), model.renderer),
-        )
+        field = RefinedField(encoding.triplane, model.decoder)
+        return Views.of_field(SavedField(field, model.renderer), scene.target_cameras)

@@ -4,13 +4,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float
 from lightning import Callback
 from torch import Tensor
 
+from nerfdiff.cameras import Cameras
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.field_file import SavedField
 from nerfdiff.distill.trace import Step
+from nerfdiff.metrics.depth import z_depth
 from nerfdiff.model import NerfDiff
 
 
@@ -37,6 +40,33 @@ class Views:
     field: SavedField | None = None
     trace: Sequence[Step] = ()
     status: str = "ok"
+
+    @staticmethod
+    @torch.no_grad()
+    def of_field(
+        saved: SavedField,
+        cameras: Cameras,
+        denoiser_calls: int = 0,
+        field_queries: int = 0,
+        trace: Sequence[Step] = (),
+        status: str = "ok",
+    ) -> "Views":
+        """What a field shows to cameras [1, views].
+
+        Args:
+            denoiser_calls, field_queries: what it took to make the field; rendering is added here.
+        """
+        rendering = saved.field.render(saved.renderer, cameras)
+        return Views(
+            images=rendering.rgb[0].movedim(-1, 1),
+            opacity=rendering.opacity[0],
+            depth=z_depth(rendering.depth[0], cameras[0]),
+            denoiser_calls=denoiser_calls,
+            field_queries=field_queries + saved.renderer.samples_per_ray * rendering.opacity.numel(),
+            field=saved,
+            trace=trace,
+            status=status,
+        )
 
 
 @runtime_checkable

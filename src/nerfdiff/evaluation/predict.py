@@ -32,7 +32,8 @@ ORBIT = "orbit.mp4"
 def predict(subject: Subject, strategy: Strategy, rank: int = 0, processes: int = 1) -> None:
     """Predict what is still to do of one process's share; a killed run loses at most the scene in hand."""
     writer = _writer(subject, strategy)
-    pending = [scene for scene in writer.scenes[rank::processes] if scene in writer.pending()]
+    to_do = set(writer.pending())
+    pending = [scene for scene in writer.scenes[rank::processes] if scene in to_do]
     if subject.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(subject.device)
     with Progress(

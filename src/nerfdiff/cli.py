@@ -18,18 +18,24 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+from nerfdiff.cpu_memory import keep_freed_memory
 from nerfdiff.errors import ConfigError, UserError
 
 CONF = Path(__file__).parents[2] / "conf"
 
 # What a value must be, by the type of its default.
-SIZES = ("image_size", "crop")  # one side of a square, or [height, width]
 KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
     bool: ("bool", (bool,)),
     int: ("int", (int,)),
     float: ("int or float", (int, float)),
     list: ("a list", (list,)),
     DictConfig: ("a mapping", (dict,)),
+}
+# Keys that take values of two kinds.
+EITHER: dict[str, tuple[type, ...]] = {
+    "image_size": (int, list),  # one side of a square, or [height, width]
+    "crop": (int, list),
+    "checkpointing": (bool, list),  # everywhere or nowhere, or at some resolutions
 }
 OPTIONAL_GROUPS = ("logger", "experiment", "sweep")
 
@@ -64,6 +70,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], object]], 
                 check_overrides(config_name, sys.argv[1:])
             except ConfigError as error:
                 sys.exit(f"error: {error}")
+            keep_freed_memory()
             command()
 
         return main
@@ -212,7 +219,7 @@ def _check_kind(default: object, override: Override) -> None:
     interpolated = isinstance(value, str) and "${" in value
     if type(default) not in KINDS or value is None or interpolated or override.is_sweep_override():
         return
-    if override.key_or_group.rpartition(".")[2] in SIZES and isinstance(value, (int, list)):
+    if isinstance(value, EITHER.get(override.key_or_group.rpartition(".")[2], ())):
         return
     name, allowed = KINDS[type(default)]
     if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):

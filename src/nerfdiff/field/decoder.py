@@ -1,5 +1,9 @@
 """The NeRF module f_θ: a shallow MLP on triplane features (paper, "Implementation Details")."""
 
+import copy
+from collections.abc import Callable
+
+import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -35,11 +39,37 @@ class Decoder(nn.Module):
             "density_scale": self.density_scale,
         }
 
+    def for_scenes(self, scenes: int) -> "Decoder":
+        """A copy to fit: for several scenes, one whose parameters are each scene's own, along a leading axis."""
+        return self._changed(lambda value: value.expand(scenes, *value.shape) if scenes > 1 else value)
+
+    def of_scene(self, scene: int) -> "Decoder":
+        """A copy with one scene's parameters, of a decoder made `for_scenes`."""
+        return self._changed(lambda value: value[scene] if self.hidden.weight.ndim == 3 else value)
+
+    def _changed(self, function: Callable[[Tensor], Tensor]) -> "Decoder":
+        copied = copy.deepcopy(self)
+        for layer in (copied.hidden, copied.output):
+            for name, value in list(layer.named_parameters()):
+                setattr(layer, name, nn.Parameter(function(value.detach()).clone()))
+        return copied
+
     def forward(
         self, features: Float[Tensor, "*points channels"]
     ) -> tuple[Float[Tensor, "*points 3"], Float[Tensor, "*points"]]:
         """Colour in [0, 1], and density per unit of the frustum's depth, both fp32."""
-        out = at_least_single(self.output(F.silu(self.hidden(features))))
+        return self.activated(_linear(self.output, F.silu(_linear(self.hidden, features))))
+
+    def activated(self, out: Float[Tensor, "*points 4"]) -> tuple[Float[Tensor, "*points 3"], Float[Tensor, "*points"]]:
+        """Colour and density from the output layer's numbers."""
+        out = at_least_single(out)
         # Softplus: exp overflows in half precision, and a ReLU dies on white backgrounds.
         density = self.density_scale * F.softplus(out[..., 3] + self.density_shift)
         return out[..., :3].sigmoid(), density
+
+
+def _linear(layer: nn.Linear, x: Float[Tensor, "*points channels"]) -> Float[Tensor, "*points out"]:
+    """A layer, or one for each scene of a batch [scenes, n, channels]."""
+    if layer.weight.ndim == 2:
+        return layer(x)
+    return torch.baddbmm(layer.bias[:, None], x, layer.weight.mT)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfdiff.cameras import Cameras
-from nerfdiff.diffusion.unet import UNet
+from nerfdiff.diffusion.unet import Context, UNet
 from nerfdiff.field.triplane import Triplane
 
 
@@ -18,12 +18,12 @@ class Encoding:
     Args:
         source: the input images in [0, 1].
         triplane: W = e_ψ(I^s).
-        features: the encoder's features after each attention block.
+        context: what the CDM attends to: the encoder's features after each attention block, or `NerfDiff.settled`.
     """
 
     source: Float[Tensor, "batch 3 height width"]
     triplane: Triplane
-    features: list[Float[Tensor, "batch _c _h _w"]]
+    context: Context
 
 
 class Encoder(nn.Module):

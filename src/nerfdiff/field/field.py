@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfdiff.field.decoder import Decoder
@@ -26,5 +26,11 @@ class TriplaneField:
     ) -> tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n"]]:
         features, valid = self.triplane.sample(points)
         rgb, density = self.decoder(features)
+        return rgb, self.per_scene_unit(density, valid)
+
+    def per_scene_unit(
+        self, density: Float[Tensor, "batch n"], valid: Bool[Tensor, "batch n"]
+    ) -> Float[Tensor, "batch n"]:
+        """The decoder's density, which is per unit of the frustum's depth; 0 where the features are not valid."""
         depth = (self.triplane.far - self.triplane.near)[:, None]
-        return rgb, torch.where(valid, density / depth, 0.0)
+        return torch.where(valid, density / depth, 0.0)

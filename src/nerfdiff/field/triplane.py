@@ -1,5 +1,6 @@
 """Camera-aligned triplanes: ξ_W(x) of the paper (eq. in "Single-image NeRF with Local Triplanes")."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -7,7 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerfdiff.cameras import Cameras
+from nerfdiff.cameras import Cameras, along_axes
 from nerfdiff.precision import at_least_single, full_precision
 
 # Which of (x̃, ỹ, z̃) runs along the (width, height) of each plane: W_xy, W_xz, W_yz.
@@ -31,6 +32,12 @@ class Triplane:
     near: Float[Tensor, "batch"]
     far: Float[Tensor, "batch"]
 
+    @staticmethod
+    def join(triplanes: Sequence["Triplane"]) -> "Triplane":
+        """Triplanes of one size, one after the other in one batch."""
+        planes, near, far = (torch.cat([getattr(t, name) for t in triplanes]) for name in ("planes", "near", "far"))
+        return Triplane(planes, Cameras.join([t.cameras for t in triplanes]), near, far)
+
     def frustum_coordinates(
         self, points: Float[Tensor, "batch n 3"]
     ) -> tuple[Float[Tensor, "batch n 3"], Bool[Tensor, "batch n"]]:
@@ -40,16 +47,15 @@ class Triplane:
         t_n are masked before the division: behind the camera they would project to mirrored features.
         """
         near, far = self.near[:, None], self.far[:, None]
-        z = points[..., 2]
+        x, y, z = points.unbind(-1)
         valid = z >= near
-        K, size = self.cameras.K, points.new_tensor([self.cameras.width, self.cameras.height])
-        focal = torch.stack([K[:, 0, 0], K[:, 1, 1]], -1)[:, None]
-        principal = K[:, None, :2, 2]
-        pixels = focal * points[..., :2] / torch.where(valid, z, 1.0)[..., None] + principal
-        projected = 2 * pixels / size - 1
+        before = torch.where(valid, z, 1.0)
+        fx, fy, cx, cy = (self.cameras.K[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        u, v = fx * x / before + cx, fy * y / before + cy
+        projected = [2 * u / self.cameras.width - 1, 2 * v / self.cameras.height - 1]
         depth = 2 * (z - near) / (far - near) - 1
-        coordinates = torch.cat([projected, depth[..., None]], -1)
-        return torch.where(valid[..., None], coordinates, 0.0), valid
+        coordinates = [torch.where(valid, coordinate, 0.0) for coordinate in (*projected, depth)]
+        return along_axes(coordinates), valid
 
     def sample(
         self, points: Float[Tensor, "batch n 3"]

@@ -8,9 +8,14 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from nerfdiff.cameras import Cameras, Rays
+from nerfdiff.field import cpu_field
 from nerfdiff.field.field import FieldFn
+from nerfdiff.render.backend import check_choice, fused
 from nerfdiff.render.compositing import compositing_weights
 from nerfdiff.render.sampling import edges_between, importance_distances, in_bins, uniform_edges
+
+CACHED_POINTS = 2**16
+"""Points at once on a CPU, whatever `chunk` allows: more leave its caches, fewer cost more calls (measured)."""
 
 
 @dataclass(frozen=True)
@@ -36,14 +41,27 @@ class Renderer:
         uniform_samples, importance_samples: per ray; the paper uses 64 and 64.
         background: grey level behind everything (1 is white); None where a scene has no empty background: the
             farthest sample of each ray is then opaque.
-        chunk: points per evaluation of the field at most. Under autograd each chunk is recomputed in the backward
-            pass, so what is kept, beside the rays themselves, is O(chunk) whatever the number of samples.
+        chunk: points whose intermediate values memory holds. Rendering takes them at most at once; under autograd, rays
+            with more points are recomputed chunk by chunk in the backward pass, so what is kept, beside the rays
+            themselves, is O(chunk) whatever the number of samples.
+        backend: `torch` is this reference; `triton` renders triplane fields by fused kernels; `auto` takes these on a
+            GPU. Where kernels cannot run, the reference does, and a log line says why.
+        precision: of the kernels' products, whose sums are fp32: `ieee` (slow), `tf32x3` (nearly fp32), `tf32`, `bf16`,
+            or `auto` for what the reference's products are computed in.
+
+    Raises:
+        ConfigError: another `backend` or `precision`.
     """
 
     uniform_samples: int
     importance_samples: int
     background: float | None
     chunk: int
+    backend: str = "auto"
+    precision: str = "auto"
+
+    def __post_init__(self):
+        check_choice(self.backend, self.precision)
 
     @property
     def samples_per_ray(self) -> int:
@@ -55,20 +73,19 @@ class Renderer:
         Args:
             jitter: uniform in [0, 1), last axis `samples_per_ray`; None is deterministic.
         """
-        batch, n = rays.near.shape
-        per_chunk = max(1, self.chunk // (batch * self.samples_per_ray))
+        values = fused(self, field, rays, jitter)
+        if values is not None:
+            return Rendering(*values)
+        per_ray = rays.near.shape[0] * self.samples_per_ray
+        recompute = torch.is_grad_enabled() and rays.near.shape[1] > max(1, self.chunk // per_ray)
         parts = [rays.origins, rays.directions, rays.near, rays.far]
         if jitter is not None:
             parts.append(jitter)
-        recompute = torch.is_grad_enabled() and n > per_chunk
-        outputs = []
-        for chunk in zip(*(part.split(per_chunk, dim=1) for part in parts), strict=True):
-            if recompute:
-                # Nothing random happens inside: the jitter is an argument.
-                outputs.append(checkpoint(self._render, field, *chunk, use_reentrant=False, preserve_rng_state=False))
-            else:
-                outputs.append(self._render(field, *chunk))
-        return Rendering(*(torch.cat(values, dim=1) for values in zip(*outputs, strict=True)))
+        if not cpu_field.suits(field, rays):
+            return Rendering(*self._in_chunks(field, parts, recompute))
+        scenes = zip(cpu_field.scene_by_scene(field), *(part.split(1) for part in parts), strict=True)
+        outputs = [self._in_chunks(alone, own, recompute) for alone, *own in scenes]
+        return Rendering(*(torch.cat(values) for values in zip(*outputs, strict=True)))
 
     def render_views(
         self,
@@ -93,6 +110,19 @@ class Renderer:
         )
         out = self.render(field, flat, jitter)
         return Rendering(out.rgb.reshape(*shape, 3), out.opacity.reshape(shape), out.depth.reshape(shape))
+
+    def _in_chunks(self, field, parts, recompute):
+        """The values of a `Rendering`, of rays split along their second axis."""
+        points = min(self.chunk, CACHED_POINTS) if parts[0].device.type == "cpu" else self.chunk
+        per_chunk = max(1, points // (len(parts[0]) * self.samples_per_ray))
+        outputs = []
+        for chunk in zip(*(part.split(per_chunk, dim=1) for part in parts), strict=True):
+            if recompute:
+                # Nothing random happens inside: the jitter is an argument.
+                outputs.append(checkpoint(self._render, field, *chunk, use_reentrant=False, preserve_rng_state=False))
+            else:
+                outputs.append(self._render(field, *chunk))
+        return [torch.cat(values, dim=1) for values in zip(*outputs, strict=True)]
 
     def _render(self, field, origins, directions, near, far, jitter=None):
         rays = Rays(origins, directions, near, far)

@@ -1,0 +1,232 @@
+"""Which renderer: the fused kernels where they can do the same as the PyTorch reference, else the reference."""
+
+import logging
+from dataclasses import replace
+from functools import cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerfdiff.cameras import Rays
+from nerfdiff.errors import ConfigError
+from nerfdiff.field.decoder import Decoder
+from nerfdiff.field.field import FieldFn, TriplaneField
+from nerfdiff.field.triplane import Triplane
+
+log = logging.getLogger(__name__)
+
+BACKENDS = ("auto", "torch", "triton")
+PRECISIONS = ("auto", "ieee", "tf32x3", "tf32", "bf16")
+
+Outputs = tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n"], Float[Tensor, "batch n"]]
+
+_WIDEST = 64
+"""Channels and hidden units for which a program's tiles fit registers and shared memory."""
+_MOST_DRAWN = 1024
+"""Importance samples that a program holds at once."""
+_POINTS_PER_QUERY = 16
+"""The kernels keep 8 bytes of a sample where the reference's backward pass keeps 0.8 kB of a point."""
+
+_told: set[str] = set()
+_failures: dict[tuple, str] = {}
+
+
+def check_choice(backend: str, precision: str) -> None:
+    """Raises ConfigError unless both are known."""
+    for name, choice, choices in (("backend", backend, BACKENDS), ("precision", precision, PRECISIONS)):
+        if choice not in choices:
+            raise ConfigError(f"render.{name}={choice!r}: choose {', '.join(choices)}")
+
+
+@torch.compiler.disable
+def fused(renderer, field: FieldFn, rays: Rays, jitter: Float[Tensor, "batch n samples"] | None) -> Outputs | None:
+    """Colour, opacity and depth by the fused kernels; None where the reference has to render.
+
+    `auto` takes the kernels for triplane fields on a GPU. Where they were wanted and cannot run, one line says why,
+    once for each reason.
+    """
+    if renderer.backend == "torch":
+        return None
+    if renderer.backend == "auto" and not (rays.near.is_cuda and isinstance(field, TriplaneField)):
+        return None
+    reason = _obstacle(renderer, field, rays, jitter)
+    if reason is None:
+        try:
+            return _render(renderer, field, rays, jitter)
+        except torch.OutOfMemoryError:
+            raise
+        except Exception as error:
+            reason = _note_failure(_kind(renderer, field), "the forward pass", error, rays.near.device)
+    _tell(reason)
+    return None
+
+
+def _tell(reason: str) -> None:
+    if reason not in _told:
+        _told.add(reason)
+        log.warning("no fused rendering, the PyTorch reference takes over: %s", reason)
+
+
+def _note_failure(kind: tuple, what: str, error: Exception, device: torch.device) -> str:
+    """Remember not to try again what cannot be compiled or launched."""
+    if device.type == "cuda" and torch.cuda.is_current_stream_capturing():
+        # what breaks the recording of a graph may well run outside of one: who records decides
+        raise error
+    lines = str(error).strip().splitlines()
+    _failures[kind] = f"{what} failed ({type(error).__name__}: {lines[0] if lines else 'no message'})"
+    return _failures[kind]
+
+
+def _kind(renderer, field: TriplaneField) -> tuple:
+    """What compilation depends on."""
+    planes, weight = field.triplane.planes, field.decoder.hidden.weight
+    opaque = renderer.background is None
+    return planes.device, planes.shape[2], weight.shape[-2], weight.ndim, opaque, _precision(renderer, planes.device)
+
+
+@cache
+def _missing() -> str | None:
+    """Why the kernels cannot be imported."""
+    try:
+        import nerfdiff.render.kernels.function  # noqa: F401
+    except ImportError as error:
+        return f"triton cannot be imported ({error})"
+    return None
+
+
+def _interpreted() -> bool:
+    from nerfdiff.render.kernels.tuning import INTERPRETED
+
+    return INTERPRETED
+
+
+def _obstacle(renderer, field: FieldFn, rays: Rays, jitter: Tensor | None) -> str | None:
+    """Why the kernels cannot render this as the reference does."""
+    if type(field) is not TriplaneField or type(field.decoder) is not Decoder:
+        return "the field is not a triplane with this project's decoder"
+    return (
+        _missing() or _device_obstacle(field.triplane.planes.device) or _tensor_obstacle(renderer, field, rays, jitter)
+    )
+
+
+def _device_obstacle(device: torch.device) -> str | None:
+    if device.type == "cpu":
+        return None if _interpreted() else "on a CPU kernels run in Triton's interpreter only (TRITON_INTERPRET=1)"
+    if device.type != "cuda":
+        return f"no kernels for device {device}"
+    capability = torch.cuda.get_device_capability(device)
+    if capability < (8, 0):
+        return f"compute capability {capability[0]}.{capability[1]}, kernels take 8.0 or newer"
+    return None
+
+
+def _tensor_obstacle(renderer, field: TriplaneField, rays: Rays, jitter: Tensor | None) -> str | None:
+    triplane = field.triplane
+    planes, parameters = triplane.planes, list(field.decoder.parameters())
+    scenes, _, channels, height, width = planes.shape
+    hidden = field.decoder.hidden.weight.shape[-2]
+    fixed = [rays.near, rays.far, triplane.near, triplane.far, triplane.cameras.K]
+    fixed += [] if jitter is None else [jitter]
+    exact = [rays.origins, rays.directions, *fixed]
+    devices = {t.device for t in (planes, *parameters, *exact)}
+    if len(devices) > 1:
+        return f"tensors on {', '.join(sorted(map(str, devices)))}"
+    halves = (torch.float32, torch.bfloat16, torch.float16)
+    odd = {t.dtype for t in exact} - {torch.float32} | {t.dtype for t in (planes, *parameters)} - set(halves)
+    if odd:
+        return f"no kernels for {', '.join(sorted(map(str, odd)))}"
+    if rays.near.numel() == 0 or renderer.uniform_samples < 1 or renderer.importance_samples < 0:
+        return "there is nothing to render"
+    if len(rays.near) != scenes or any(t.ndim == 3 and len(t) != scenes for t in parameters):
+        return f"{scenes} triplanes do not match the rays' or the decoders' batch"
+    if jitter is not None and jitter.shape != (*rays.near.shape, renderer.samples_per_ray):
+        return f"jitter of shape {tuple(jitter.shape)}"
+    if max(channels, hidden) > _WIDEST or renderer.importance_samples > _MOST_DRAWN:
+        return (
+            f"{channels} channels, {hidden} hidden units, {renderer.importance_samples} importance samples: "
+            f"kernels take {_WIDEST}, {_WIDEST} and {_MOST_DRAWN} at most"
+        )
+    if 3 * height * width * channels >= 2**31:
+        return f"planes of {height} × {width} × {channels} are too large to index"
+    if torch.is_grad_enabled() and any(t.requires_grad for t in fixed):
+        return "near, far, intrinsics and jitter get no gradients from kernels"
+    return _failures.get(_kind(renderer, field))
+
+
+def _precision(renderer, device: torch.device) -> str:
+    """Of products: what the reference's would be computed in."""
+    chosen = renderer.precision
+    if chosen == "auto":
+        chosen = _regime(device)
+    return "rounded" if chosen == "bf16" and _interpreted() else chosen
+
+
+def _regime(device: torch.device) -> str:
+    """The least that rounds no more than autocast, or a product of fp32 matrices, would."""
+    if torch.is_autocast_enabled(device.type):
+        # products of tf32 have fp16's mantissa and lack its overflow
+        return "bf16" if torch.get_autocast_dtype(device.type) == torch.bfloat16 else "tf32"
+    if device.type != "cuda":
+        return "ieee"
+    own = torch.backends.cuda.matmul.fp32_precision
+    # Three products of tf32 are within a few bits of fp32's; fp32's own spill the backward pass's registers to memory.
+    return "tf32" if (torch.backends.fp32_precision if own == "none" else own) == "tf32" else "tf32x3"
+
+
+def _render(renderer, field: TriplaneField, rays: Rays, jitter: Tensor | None) -> Outputs:
+    from nerfdiff.render.kernels.arguments import Settings
+    from nerfdiff.render.kernels.function import fused_render
+
+    triplane, decoder = field.triplane, field.decoder
+    settings = Settings(
+        uniform_samples=renderer.uniform_samples,
+        importance_samples=renderer.importance_samples,
+        background=renderer.background,
+        points=_POINTS_PER_QUERY * renderer.chunk,
+        ordered_points=renderer.chunk,
+        precision=_precision(renderer, triplane.planes.device),
+        ordered=torch.are_deterministic_algorithms_enabled(),
+        image_width=triplane.cameras.width,
+        image_height=triplane.cameras.height,
+        density_shift=decoder.density_shift,
+        density_scale=decoder.density_scale,
+    )
+    kind = _kind(renderer, field)
+
+    def recover(error, tensors, d_outputs, needed):
+        _tell(_note_failure(kind, "the backward pass", error, triplane.planes.device))
+        return _reference_gradients(renderer, field, settings.precision, tensors, d_outputs, needed)
+
+    return fused_render(
+        settings,
+        recover,
+        triplane.planes,
+        *(getattr(layer, name) for layer in (decoder.hidden, decoder.output) for name in ("weight", "bias")),
+        rays.origins,
+        rays.directions,
+        triplane.cameras.K,
+        triplane.near,
+        triplane.far,
+        rays.near,
+        rays.far,
+        jitter,
+    )
+
+
+def _reference_gradients(renderer, field, precision, tensors, d_outputs, needed) -> list[Tensor | None]:
+    """The reference's gradients of the first 7 tensors, for a picture whose own backward pass failed."""
+    leaves = [tensor.detach().requires_grad_() for tensor in tensors[:7]]
+    planes, *parameters, origins, directions = leaves
+    _, near, far, ray_near, ray_far, jitter = tensors[7:]
+    decoder = Decoder(**field.decoder.settings)
+    for i, layer in enumerate((decoder.hidden, decoder.output)):
+        layer.weight, layer.bias = (nn.Parameter(value.detach()) for value in parameters[2 * i : 2 * i + 2])
+    leaves[1:5] = [decoder.hidden.weight, decoder.hidden.bias, decoder.output.weight, decoder.output.bias]
+    half = precision in ("bf16", "rounded")
+    with torch.enable_grad(), torch.autocast(planes.device.type, torch.bfloat16, enabled=half):
+        again = TriplaneField(Triplane(planes, field.triplane.cameras, near, far), decoder)
+        out = replace(renderer, backend="torch").render(again, Rays(origins, directions, ray_near, ray_far), jitter)
+    wanted = [leaf for leaf, need in zip(leaves, needed, strict=True) if need]
+    found = iter(torch.autograd.grad((out.rgb, out.opacity, out.depth), wanted, d_outputs))
+    return [next(found) if need else None for need in needed]

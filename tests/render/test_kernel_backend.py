@@ -1,0 +1,174 @@
+"""Which renderer is taken, and that the reference takes over wherever kernels cannot."""
+
+import logging
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+
+pytest.importorskip("triton")
+
+from fused_scenes import DEVICE, Case, without_trials
+from nerfdiff.errors import ConfigError
+from nerfdiff.render import backend
+from nerfdiff.render.kernels import function, tuning
+from nerfdiff.render.renderer import Renderer
+
+
+@pytest.fixture(autouse=True)
+def _nothing_told_yet(monkeypatch, caplog):
+    for name, value in (("_told", set()), ("_failures", {})):
+        monkeypatch.setattr(backend, name, value)
+    without_trials(monkeypatch)
+    backend._missing.cache_clear()
+    caplog.set_level(logging.WARNING, logger=backend.__name__)
+    yield
+    backend._missing.cache_clear()
+
+
+class Scene:
+    """A case with its field and rays where the kernels run."""
+
+    def __init__(self, dtype=torch.float32, **sizes):
+        self.case = Case(n=1, uniform=2, importance=2, **sizes)
+        self.leaves = [leaf.to(DEVICE, dtype) for leaf in self.case.leaves]
+        self.field, self.rays = self.case.field(self.leaves), self.case.rays(self.leaves)
+        self.jitter = self.case.jitter.to(DEVICE, dtype)
+        self.reference = self.case.renderer
+        self.triton = replace(self.reference, backend="triton")
+
+    def taken_over(self, caplog, why: str, **changes) -> None:
+        """The reference's numbers to the bit, and one line that says why, also when asked twice."""
+        given = {"field": self.field, "rays": self.rays, "jitter": self.jitter} | changes
+        expected = self.reference.render(**given)
+        for _ in range(2):
+            found = self.triton.render(**given)
+            for name in ("rgb", "opacity", "depth"):
+                assert torch.equal(getattr(found, name), getattr(expected, name))
+        assert [record.levelname for record in caplog.records] == ["WARNING"]
+        assert why in caplog.messages[0]
+        assert "reference takes over" in caplog.messages[0]
+
+
+def test_the_kernels_render_when_asked(caplog):
+    scene = Scene()
+    found = scene.triton.render(scene.field, scene.rays, scene.jitter)
+    expected = scene.case.reference()[0]
+    assert (found.rgb.cpu() - expected[0]).abs().max() < 1e-5
+    assert (found.depth.cpu() - expected[2]).abs().max() < 1e-5
+    assert found.rgb.grad_fn.name().startswith("FusedRender")
+    assert not caplog.records
+
+
+def test_auto_takes_kernels_on_a_gpu_only(caplog):
+    scene = Scene()
+    assert scene.reference.backend == "torch" and Renderer(1, 1, 1.0, 1).backend == "auto"
+    out = replace(scene.reference, backend="auto").render(scene.field, scene.rays, scene.jitter)
+    assert out.rgb.grad_fn.name().startswith("FusedRender") == (DEVICE.type == "cuda")
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("wrong", [{"backend": "cuda"}, {"precision": "fp8"}])
+def test_unknown_choices_are_errors(wrong):
+    with pytest.raises(ConfigError, match="choose auto"):
+        Renderer(1, 1, 1.0, 1, **wrong)
+
+
+def test_no_triton(monkeypatch, caplog):
+    monkeypatch.setitem(sys.modules, "nerfdiff.render.kernels.function", None)
+    Scene().taken_over(caplog, "triton cannot be imported")
+
+
+def test_other_fields(caplog):
+    scene = Scene()
+    scene.taken_over(caplog, "not a triplane", field=lambda points: scene.field(points))
+
+
+def test_float64(caplog):
+    Scene(torch.float64).taken_over(caplog, "torch.float64")
+
+
+def test_too_wide(caplog):
+    Scene(hidden=65).taken_over(caplog, "65 hidden units")
+
+
+def test_rays_whose_bounds_are_learned(caplog):
+    scene = Scene()
+    scene.taken_over(caplog, "get no gradients", rays=replace(scene.rays, far=scene.rays.far.requires_grad_()))
+
+
+def test_no_rays():
+    scene = Scene()
+    none = replace(scene.rays, **{name: getattr(scene.rays, name)[:, :0] for name in vars(scene.rays)})
+    assert "nothing to render" in backend._obstacle(scene.triton, scene.field, none, None)
+
+
+def test_old_gpus_and_other_devices(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (7, 5))
+    assert "compute capability 7.5" in backend._device_obstacle(torch.device("cuda", 0))
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (9, 0))
+    assert backend._device_obstacle(torch.device("cuda", 0)) is None
+    assert "mps" in backend._device_obstacle(torch.device("mps"))
+    monkeypatch.setattr(tuning, "INTERPRETED", False)
+    assert "interpreter" in backend._device_obstacle(torch.device("cpu"))
+
+
+def test_a_kernel_that_fails_is_not_tried_again(monkeypatch, caplog):
+    calls = []
+
+    def fails(*_):
+        calls.append(1)
+        raise RuntimeError("out of resource: shared memory\nRequired: 300000")
+
+    monkeypatch.setattr(function, "render", fails)
+    Scene().taken_over(caplog, "the forward pass failed (RuntimeError: out of resource: shared memory)")
+    assert len(calls) == 1
+
+
+def test_a_backward_pass_that_fails_is_done_by_the_reference(monkeypatch, caplog):
+    def fails(*_, **__):
+        raise RuntimeError("ptxas")
+
+    monkeypatch.setattr(function, "gradients", fails)
+    scene = Scene(scenes=2, own_decoders=True)
+    planes = scene.field.triplane.planes.requires_grad_()
+    wanted = [planes, *scene.field.decoder.parameters()]
+    colours = scene.case.d_outputs[0].to(DEVICE)
+    found, expected = (
+        torch.autograd.grad(renderer.render(scene.field, scene.rays, scene.jitter).rgb, wanted, colours)
+        for renderer in (scene.triton, scene.reference)
+    )
+    for value, truth in zip(found, expected, strict=True):
+        assert (value - truth).abs().max() <= 1e-4 * truth.abs().max()
+    out = scene.triton.render(scene.field, scene.rays, scene.jitter)
+    assert not out.rgb.grad_fn.name().startswith("FusedRender")
+    assert len(caplog.records) == 1 and "the backward pass failed (RuntimeError: ptxas)" in caplog.messages[0]
+
+
+def test_memory_that_runs_out_is_not_hidden(monkeypatch):
+    def fails(*_):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(function, "render", fails)
+    scene = Scene()
+    with pytest.raises(torch.OutOfMemoryError):
+        scene.triton.render(scene.field, scene.rays, scene.jitter)
+
+
+def test_products_are_the_reference_s(monkeypatch):
+    renderer, gpu = Renderer(1, 1, 1.0, 1), torch.device("cuda", 0)
+    monkeypatch.setattr(tuning, "INTERPRETED", False)
+    assert backend._precision(renderer, torch.device("cpu")) == "ieee"
+    with torch.autocast("cpu", torch.bfloat16):
+        assert backend._precision(renderer, torch.device("cpu")) == "bf16"
+    assert backend._precision(renderer, gpu) == "tf32x3"
+    before = torch.backends.cuda.matmul.fp32_precision
+    try:
+        torch.backends.cuda.matmul.fp32_precision = "tf32"
+        assert backend._precision(renderer, gpu) == "tf32"
+    finally:
+        torch.backends.cuda.matmul.fp32_precision = before
+    assert backend._precision(replace(renderer, precision="ieee"), gpu) == "ieee"
+    monkeypatch.setattr(tuning, "INTERPRETED", True)
+    assert backend._precision(replace(renderer, precision="bf16"), gpu) == "rounded"

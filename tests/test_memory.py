@@ -6,7 +6,7 @@ import torch
 from model_fixtures import config
 from nerfdiff import memory
 from nerfdiff.errors import ConfigError
-from nerfdiff.memory import PeakMemory, is_tight, require_memory, training_memory
+from nerfdiff.memory import PeakMemory, TrainingMemory, is_tight, require_memory, training_memory
 from nerfdiff.model import build_on_meta
 
 
@@ -35,18 +35,41 @@ def test_activations_kept_for_the_backward_pass_count():
 
 def test_a_step_holds_the_gradients_and_grows_with_the_batch_but_little_with_checkpointing():
     parameters = sum(p.numel() for p in build_on_meta(config()).parameters())
-    one, four = (training_memory(config(), batch, 1, 16, 16) for batch in (1, 4))
+    one, four = (training_memory(config(), batch, 1, 16, 16, "32-true") for batch in (1, 4))
     assert one.state == 16 * parameters and one.step > 4 * parameters
     assert four.state == one.state and four.step > one.step
-    frugal = training_memory(config(unet={"checkpointing": True}, render={"chunk": 512}), 4, 1, 16, 16)
+    frugal = training_memory(config(unet={"checkpointing": True}, render={"chunk": 512}), 4, 1, 16, 16, "32-true")
     assert frugal.step < four.step
+    mixed = training_memory(config(), 4, 1, 16, 16, "bf16-mixed")
+    assert mixed.state == four.state and mixed.step < four.step
+
+
+def test_recomputing_at_more_resolutions_keeps_less():
+    sizes = [
+        training_memory(config(unet={"checkpointing": choice}), 8, 1, 16, 16, "32-true").step
+        for choice in (False, [1], [2], True)
+    ]
+    assert sizes == sorted(sizes, reverse=True) and len(set(sizes)) == 4
+
+
+@pytest.mark.parametrize("batch", [1, 5])
+def test_the_largest_batch_is_the_last_that_fits(batch, monkeypatch):
+    monkeypatch.setattr(memory, "training_memory", lambda *a: TrainingMemory(1000, 10 * a[1] + a[1] // 4))
+    for spare, expected in ((0, batch), (9, batch), (-1, batch - 1)):
+        available = memory.training_memory({}, batch).total + spare
+        assert memory.largest_batch({}, available, 1, 16, 16, "32-true") == expected
+
+
+def test_the_largest_batch_of_a_traced_model_fits_and_one_more_does_not():
+    available = training_memory(config(), 3, 1, 16, 16, "32-true").total
+    assert memory.largest_batch(config(), available, 1, 16, 16, "32-true") == 3
 
 
 def test_what_does_not_fit_is_refused_with_what_it_takes(monkeypatch):
     monkeypatch.setattr(memory, "free_memory", lambda device: 10**6)
     with pytest.raises(ConfigError, match=r"training takes about .* cpu has 0\.0 GiB free.*accumulate_grad_batches"):
-        require_memory(config(), torch.device("cpu"), 1, 1, 16, 16)
+        require_memory(config(), torch.device("cpu"), 1, 1, 16, 16, "32-true")
     assert is_tight(config(), torch.device("cpu"))
     monkeypatch.setattr(memory, "free_memory", lambda device: 10**15)
-    require_memory(config(), torch.device("cpu"), 1, 1, 16, 16)
+    require_memory(config(), torch.device("cpu"), 1, 1, 16, 16, "32-true")
     assert not is_tight(config(), torch.device("cpu"))

@@ -1,6 +1,7 @@
 """NerfDiff: the single-image NeRF and the CDM, side by side, free of any training framework."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -46,6 +47,12 @@ class NerfDiff(nn.Module):
         """Input images in [0, 1] to triplanes and features."""
         return self.encoder(source, cameras, near, far)
 
+    def settled(self, encoding: Encoding) -> Encoding:
+        """The same encoding for many calls of the CDM: its features as the keys and values that attention makes of
+        them, which depend neither on the view nor on the diffusion step."""
+        keys_values = self.denoiser.unet.keys_values(encoding.context) if self.denoiser.cross_attention else []
+        return replace(encoding, context=keys_values)
+
     def field(self, encoding: Encoding) -> TriplaneField:
         """The radiance field of each scene."""
         return TriplaneField(encoding.triplane, self.decoder)
@@ -65,10 +72,10 @@ class NerfDiff(nn.Module):
         views = cameras.shape[1]
         return Condition(
             rendered=rendering.rgb.flatten(0, 1).movedim(-1, 1),
-            source=_for_each_view(encoding.source, views),
+            source=encoding.source[:, None].expand(-1, views, -1, -1, -1).flatten(0, 1),
             cameras=cameras.flatten(),
             near=encoding.triplane.near.repeat_interleave(views),
-            features=[_for_each_view(feature, views) for feature in encoding.features],
+            context=encoding.context,
         )
 
     def denoise(
@@ -90,8 +97,3 @@ def build_on_meta(config: Mapping) -> NerfDiff:
     """The model on the meta device: shapes and counts without memory."""
     with torch.device("meta"):
         return NerfDiff(**config)
-
-
-def _for_each_view(values: Tensor, views: int) -> Tensor:
-    """Each entry of the batch, repeated for its views; of a single scene without copying."""
-    return values.expand(views, *values.shape[1:]) if len(values) == 1 else values.repeat_interleave(views, 0)

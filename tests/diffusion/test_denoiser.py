@@ -72,6 +72,21 @@ def test_only_a_rendered_condition_can_be_built_upon():
         model(conditioning={"image": "source", "ray_maps": True, "residual_std": 0.2})
 
 
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_settled_encoding_conditions_as_the_encoding_itself(variant):
+    net = build(variant)
+    source, near, far = torch.rand(2, 3, 16, 16), torch.full((2,), 0.8), torch.full((2,), 1.8)
+    with torch.no_grad():
+        encoding = net.encode(source, input_cameras(2), near, far)
+        wanted = Cameras(views().c2w.expand(2, 2, 4, 4), views().K.expand(2, 2, 3, 3), 16, 16)
+        rendering, z = net.render(encoding, wanted), torch.randn(4, 3, 16, 16)
+        plain, settled = (
+            net.denoise(z, torch.tensor(0.5), net.condition(known, wanted, rendering))
+            for known in (encoding, net.settled(encoding))
+        )
+    torch.testing.assert_close(settled, plain, atol=1e-4, rtol=1e-4)
+
+
 def test_the_denoising_loss_flows_back_through_the_rendering():
     net = build("rendered")
     condition = condition_of(net, torch.rand(1, 3, 16, 16))

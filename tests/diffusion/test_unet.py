@@ -1,11 +1,15 @@
 import math
+from collections import Counter
 
 import pytest
 import torch
+import torch.nn.functional as F
 
 from model_fixtures import config
-from nerfdiff.diffusion.blocks import Attention, time_embedding
-from nerfdiff.diffusion.unet import UNet
+from nerfdiff.diffusion.blocks import Attention, Upsample, time_embedding
+from nerfdiff.diffusion.deep_features import DeepFeatures, DeepReuse
+from nerfdiff.diffusion.unet import Stage, UNet
+from nerfdiff.errors import ConfigError
 
 SMALL = config()["unet"]
 
@@ -80,15 +84,125 @@ def test_zero_output_starts_at_zero():
     assert torch.equal(out, torch.zeros(1, 5, 8, 8))
 
 
-def test_checkpointing_changes_memory_not_gradients():
+@pytest.mark.parametrize("checkpointing", [True, [1], [2], [1, 2]])
+def test_checkpointing_changes_memory_not_gradients(checkpointing):
     x, t = torch.randn(2, 3, 8, 8), torch.rand(2)
     gradients = []
-    for checkpointing in (False, True):
-        net = unet(checkpointing=checkpointing)
+    for choice in (False, checkpointing):
+        net = unet(checkpointing=choice)
         net(x, t)[0].square().sum().backward()
         gradients.append([p.grad for p in net.parameters()])
     for plain, recomputed in zip(*gradients, strict=True):
         torch.testing.assert_close(plain, recomputed)
+
+
+@pytest.mark.parametrize(
+    ("checkpointing", "sizes"), [(False, set()), (True, {8, 4}), ([1], {8}), ([2], {4}), ([], set())]
+)
+def test_only_the_chosen_resolutions_are_recomputed(checkpointing, sizes):
+    net, runs = unet(checkpointing=checkpointing), {8: 0, 4: 0}
+    for module in net.modules():
+        if isinstance(module, Stage):
+            module.register_forward_pre_hook(
+                lambda _, inputs: runs.update(Counter([inputs[0].shape[-1]]) + Counter(runs))
+            )
+    loss = net(torch.randn(1, 3, 8, 8), torch.rand(1))[0].square().sum()
+    once = dict(runs)
+    loss.backward()
+    assert {size for size in runs if runs[size] == 2 * once[size]} == sizes
+    assert all(runs[size] == once[size] for size in runs if size not in sizes)
+
+
+@pytest.mark.parametrize("checkpointing", [[3], [1, 4]])
+def test_a_resolution_that_there_is_not_is_refused(checkpointing):
+    with pytest.raises(ConfigError, match=r"must be true, false, or some of \[1, 2\]"):
+        unet(checkpointing=checkpointing)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_views_share_the_keys_of_their_scene(dtype):
+    """A context per scene, or keys and values of it, says the same as one repeated for each view."""
+    net = unet(cross_attention=True).to(dtype)
+    _, features = unet(with_time=False).to(dtype)(torch.randn(2, 3, 8, 8, dtype=dtype))
+    x, t = torch.randn(6, 3, 8, 8, dtype=dtype), torch.rand(6, dtype=dtype)
+    expected, _ = net(x, t, [feature.repeat_interleave(3, 0) for feature in features])
+    tolerance = {"atol": 1e-4, "rtol": 1e-4} if dtype == torch.float32 else {"atol": 1e-12, "rtol": 1e-10}
+    torch.testing.assert_close(net(x, t, features)[0], expected, **tolerance)
+    torch.testing.assert_close(net(x, t, net.keys_values(features))[0], expected, **tolerance)
+
+
+def test_a_context_of_another_length_is_refused():
+    net, x, t = unet(cross_attention=True), torch.randn(1, 3, 8, 8), torch.rand(1)
+    _, features = unet(with_time=False)(x)
+    with pytest.raises(ValueError, match="zip"):
+        net(x, t, features[:-1])
+
+
+@pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
+@pytest.mark.parametrize("cross", [False, True])
+def test_fused_attention_can_take_what_it_is_given(layout, cross, monkeypatch):
+    """Kernels ask for a dense last axis; the image keeps its layout."""
+    seen = []
+    fused = F.scaled_dot_product_attention
+
+    def watched(q, k, v):
+        seen.extend((q, k, v))
+        return fused(q, k, v)
+
+    monkeypatch.setattr(F, "scaled_dot_product_attention", watched)
+    x = torch.randn(4, 64, 3, 5).to(memory_format=layout)
+    out = Attention(64, 32, cross)(x, x[:2] if cross else None)
+    assert all(tensor.stride(-1) == 1 for tensor in seen)
+    assert out.is_contiguous(memory_format=layout)
+
+
+@pytest.mark.parametrize("size", [(4, 6), (1, 1), (5, 3)])
+def test_doubling_by_a_transposed_convolution_is_nearest_neighbours_then_convolution(size):
+    layer, target = Upsample(32).double(), tuple(2 * side for side in size)
+    x = torch.randn(2, 32, *size, dtype=torch.float64, requires_grad=True)
+    fast = layer(x, target)
+    plain = layer.conv(F.interpolate(x, size=target, mode="nearest"))
+    torch.testing.assert_close(fast, plain, atol=1e-12, rtol=1e-10)
+    weights = torch.randn_like(plain)
+    inputs = (x, *layer.parameters())
+    for one, other in zip(*(torch.autograd.grad((y * weights).sum(), inputs) for y in (fast, plain)), strict=True):
+        torch.testing.assert_close(one, other, atol=1e-11, rtol=1e-10)
+
+
+def test_deep_levels_are_computed_at_every_so_many_calls():
+    net, lowest, shallow = unet(), [], []
+    net.middle[0].register_forward_hook(lambda *_: lowest.append(1))
+    net.down[0].register_forward_hook(lambda *_: shallow.append(1))
+    x, deep = torch.randn(1, 3, 8, 8), DeepFeatures(DeepReuse(every=3, below=1))
+    for step in range(7):
+        deep.advance()
+        net(x, torch.tensor([0.9 - 0.1 * step]), deep=deep)
+    assert (len(shallow), len(lowest)) == (7, 3)
+
+
+def test_reused_deep_levels_say_what_they_said_and_shallow_ones_what_they_would():
+    net, t = unet(), torch.tensor([0.5])
+    x, other = torch.randn(2, 1, 3, 8, 8)
+    deep = DeepFeatures(DeepReuse(every=2, below=1))
+    deep.advance()
+    exact, _ = net(x, t)
+    torch.testing.assert_close(net(x, t, deep=deep)[0], exact)  # computed
+    deep.advance()
+    torch.testing.assert_close(net(x, t, deep=deep)[0], exact)  # the same input: nothing is lost
+    reused, expected = net(other, t, deep=deep)[0], net(other, t)[0]
+    assert not torch.allclose(reused, expected, atol=1e-4)  # another: something is
+    held = deep.last
+    deep.advance()
+    torch.testing.assert_close(net(other, t, deep=deep)[0], expected)
+    assert not torch.equal(deep.last, held)
+
+
+def test_there_must_be_levels_to_reuse():
+    deep = DeepFeatures(DeepReuse(every=2, below=2))
+    with pytest.raises(ConfigError, match=r"below=2: of 2 resolutions none is left"):
+        unet()(torch.randn(1, 3, 8, 8), torch.rand(1), deep=deep)
+    with pytest.raises(ConfigError, match=r"deep\.every=0"):
+        DeepReuse(every=0, below=1)
 
 
 def test_a_width_groupnorm_cannot_split_is_refused():

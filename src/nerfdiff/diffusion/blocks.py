@@ -1,11 +1,14 @@
 """The building blocks of the ADM U-Net (Dhariwal & Nichol 2021)."""
 
 import math
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from nerfdiff.diffusion.norm_silu import norm_silu
 
 Features = Float[Tensor, "batch channels height width"]
 
@@ -52,16 +55,30 @@ class ResBlock(nn.Module):
     def forward(
         self, x: Features, embedding: Float[Tensor, "batch embedding"] | None
     ) -> Float[Tensor, "batch out_channels height width"]:
-        h = self.conv_in(F.silu(self.norm_in(x)))
-        h = self.norm_out(h)
-        if self.embed is not None:
-            scale, shift = self.embed(F.silu(embedding))[:, :, None, None].chunk(2, dim=1)
-            h = h * (1 + scale) + shift
-        return self.skip(x) + self.conv_out(self.dropout(F.silu(h)))
+        scale_shift = None if self.embed is None else self.embed(F.silu(embedding))
+        h = self.conv_in(norm_silu(self.norm_in, x))
+        h = norm_silu(self.norm_out, h, scale_shift)
+        return self.skip(x) + self.conv_out(self.dropout(h))
+
+
+class KeyValue(NamedTuple):
+    """What attention looks up, split into heads: of a context that stays, worth computing once.
+
+    Args:
+        key, value: one entry per scene; the images that attend to it may be several views of each.
+    """
+
+    key: Float[Tensor, "scenes heads pixels head_channels"]
+    value: Float[Tensor, "scenes heads pixels head_channels"]
 
 
 class Attention(nn.Module):
-    """Multi-head attention over pixels: to themselves, or to a context of as many channels."""
+    """Multi-head attention over pixels: to themselves, or to a context of as many channels.
+
+    Pixels are rows and channels columns, as SDPA's fused kernels ask: the innermost axis must be dense, which a plain
+    split of [batch, channels, height, width] does not give (PyTorch then falls back to the kernel that stores all
+    attention weights). In channels_last none of the steps from norm to output copies.
+    """
 
     def __init__(self, channels: int, head_channels: int, cross: bool):
         super().__init__()
@@ -72,17 +89,44 @@ class Attention(nn.Module):
         self.key_value = nn.Conv2d(channels, 2 * channels, 1)
         self.out = zero(nn.Conv2d(channels, channels, 1))
 
-    def forward(self, x: Features, context: Features | None = None) -> Features:
-        h = self.norm(x)
-        source = h if self.norm_context is None else self.norm_context(context)
-        q = self._split(self.query(h))
-        k, v = (self._split(part) for part in self.key_value(source).chunk(2, dim=1))
-        attended = F.scaled_dot_product_attention(q, k, v)
-        return x + self.out(attended.transpose(-1, -2).reshape(x.shape))
+    def forward(
+        self, x: Features, context: Float[Tensor, "scenes channels _h _w"] | KeyValue | None = None
+    ) -> Features:
+        """Attend from x [scenes · views, …] to the context of each scene, or, without one, of each image to itself.
 
-    def _split(self, x: Features) -> Float[Tensor, "batch heads pixels head_channels"]:
+        Args:
+            context: features, or what `keys_values` made of them.
+        """
         batch, channels, height, width = x.shape
-        return x.reshape(batch, self.heads, channels // self.heads, height * width).transpose(-1, -2)
+        h = _rows(self.norm(x))
+        if self.norm_context is None:
+            context = self._split_keys_values(h)
+        elif not isinstance(context, KeyValue):
+            context = self.keys_values(context)
+        # All views of a scene look the same things up: they are queries of one attention, and nothing is repeated.
+        query = _pointwise(self.query, h).reshape(len(context.key), -1, channels)
+        attended = F.scaled_dot_product_attention(self._split(query), *context)
+        out = _pointwise(self.out, attended.transpose(1, 2).flatten(2))
+        return x + out.reshape(batch, height * width, channels).mT.unflatten(2, (height, width))
+
+    def keys_values(self, context: Float[Tensor, "scenes channels _h _w"]) -> KeyValue:
+        """What `forward` looks up in a context, without looking."""
+        return self._split_keys_values(_rows(self.norm_context(context)))
+
+    def _split_keys_values(self, rows: Float[Tensor, "scenes pixels channels"]) -> KeyValue:
+        return KeyValue(*(self._split(part) for part in _pointwise(self.key_value, rows).chunk(2, dim=-1)))
+
+    def _split(self, rows: Float[Tensor, "batch pixels channels"]) -> Float[Tensor, "batch heads pixels head_channels"]:
+        return rows.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+
+
+def _rows(x: Features) -> Float[Tensor, "batch pixels channels"]:
+    return x.flatten(2).mT
+
+
+def _pointwise(conv: nn.Conv2d, rows: Float[Tensor, "batch pixels channels"]) -> Float[Tensor, "batch pixels out"]:
+    """A 1 x 1 convolution of pixels that are rows."""
+    return F.linear(rows, conv.weight.flatten(1), conv.bias)
 
 
 class Downsample(nn.Module):
@@ -105,4 +149,19 @@ class Upsample(nn.Module):
         self.conv = nn.Conv2d(channels, channels, 3, padding=1)
 
     def forward(self, x: Features, size: tuple[int, int]) -> Float[Tensor, "batch channels {size[0]} {size[1]}"]:
+        # on the CPU, where convolutions are bound by multiplications, this takes half the time (measured)
+        if x.device.type == "cpu" and tuple(size) == (2 * x.shape[2], 2 * x.shape[3]):
+            return F.conv_transpose2d(x, doubling_kernel(self.conv.weight), self.conv.bias, stride=2, padding=1)
         return self.conv(F.interpolate(x, size=size, mode="nearest"))
+
+
+def doubling_kernel(weight: Float[Tensor, "out channels 3 3"]) -> Float[Tensor, "channels out 4 4"]:
+    """The transposed convolution of stride 2 that equals doubling by nearest neighbours, then convolving.
+
+    Under the three taps a, b, c lie two different pixels: for an even output a | b + c, for an odd one a + b | c. So a
+    transposed kernel of four taps c, b + c, a + b, a has 4/9 of the multiplications.
+    """
+    for axis in (2, 3):
+        a, b, c = weight.unbind(axis)
+        weight = torch.stack([c, b + c, a + b, a], axis)
+    return weight.transpose(0, 1)

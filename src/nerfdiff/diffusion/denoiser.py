@@ -1,6 +1,6 @@
 """The 3D-aware conditional diffusion model (paper, "3D-aware Conditional Diffusion Models")."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -8,9 +8,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfdiff.cameras import Cameras
+from nerfdiff.diffusion.deep_features import DeepFeatures
 from nerfdiff.diffusion.preconditioning import gaussian_velocity
 from nerfdiff.diffusion.schedule import alpha_sigma, expand, x0_from_v
-from nerfdiff.diffusion.unet import UNet
+from nerfdiff.diffusion.unet import Context, UNet
 from nerfdiff.errors import ConfigError
 
 IMAGES = ("rendered", "source", "none")
@@ -18,21 +19,21 @@ IMAGES = ("rendered", "source", "none")
 
 @dataclass(frozen=True)
 class Condition:
-    """What the CDM may look at. All share the batch axis, one entry per view to denoise.
+    """What the CDM may look at. All but the context share the batch axis, one entry per view to denoise.
 
     Args:
         rendered: the single-image NeRF's image of the view, in [0, 1].
         source: the input image, in [0, 1].
         cameras: cameras of the views, in the input camera's space.
         near: t_n per view, to which camera positions are relative.
-        features: the encoder's features.
+        context: what cross-attention attends to, one entry per scene where the batch is scenes · views, scene by scene.
     """
 
     rendered: Float[Tensor, "batch 3 height width"]
     source: Float[Tensor, "batch 3 height width"]
     cameras: Cameras
     near: Float[Tensor, "batch"]
-    features: Sequence[Tensor]
+    context: Context
 
 
 class Denoiser(nn.Module):
@@ -69,9 +70,17 @@ class Denoiser(nn.Module):
         self.cross_attention = cross_attention
 
     def velocity(
-        self, z: Float[Tensor, "batch 3 height width"], t: Float[Tensor, "batch"], condition: Condition
+        self,
+        z: Float[Tensor, "batch 3 height width"],
+        t: Float[Tensor, "batch"],
+        condition: Condition,
+        deep: DeepFeatures | None = None,
     ) -> Float[Tensor, "batch 3 height width"]:
-        """The predicted v_t."""
+        """The predicted v_t.
+
+        Args:
+            deep: levels of the U-Net that are not computed at every call.
+        """
         inputs = [z]
         if self.image != "none":
             inputs.append(2 * getattr(condition, self.image) - 1)
@@ -79,8 +88,10 @@ class Denoiser(nn.Module):
             rays = condition.cameras.rays(condition.near, condition.near)
             origins = rays.origins / rays.near[..., None]
             inputs.append(torch.cat([origins, rays.directions], -1).movedim(-1, 1))
-        context = condition.features if self.cross_attention else ()
-        output = self.unet(torch.cat(inputs, 1), t, context)[0].float()
+        context = condition.context if self.cross_attention else ()
+        if deep is not None:
+            deep.advance()
+        output = self.unet(torch.cat(inputs, 1), t, context, deep)[0].float()
         if self.residual_std is None:
             return output
         alpha, sigma = (expand(c, z) for c in alpha_sigma(t))
@@ -88,8 +99,12 @@ class Denoiser(nn.Module):
         return mean + scale * output
 
     def forward(
-        self, z: Float[Tensor, "batch 3 height width"], t: Float[Tensor, "batch"], condition: Condition
+        self,
+        z: Float[Tensor, "batch 3 height width"],
+        t: Float[Tensor, "batch"],
+        condition: Condition,
+        deep: DeepFeatures | None = None,
     ) -> Float[Tensor, "batch 3 height width"]:
         """The denoised images x0."""
         alpha, sigma = (expand(c, z) for c in alpha_sigma(t))
-        return x0_from_v(z, self.velocity(z, t, condition), alpha, sigma)
+        return x0_from_v(z, self.velocity(z, t, condition, deep), alpha, sigma)

@@ -3,24 +3,47 @@
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from nerfdiff.diffusion.blocks import Attention, Downsample, ResBlock, Upsample, norm, time_embedding, zero
+from nerfdiff.diffusion.blocks import (
+    Attention,
+    Downsample,
+    KeyValue,
+    ResBlock,
+    Upsample,
+    norm,
+    time_embedding,
+    zero,
+)
+from nerfdiff.diffusion.deep_features import DeepFeatures
+from nerfdiff.diffusion.norm_silu import norm_silu
+from nerfdiff.errors import ConfigError
+
+Context = Sequence[Tensor | KeyValue]
+"""What a U-Net attends to, one entry per attention block: a twin's features, or `UNet.keys_values` of them."""
 
 
 class Stage(nn.Module):
-    """A residual block, then at some resolutions self-attention, then where conditioned cross-attention."""
+    """A residual block, then at some resolutions self-attention, then where conditioned cross-attention.
 
-    def __init__(self, res: ResBlock, attention: Attention | None, cross: Attention | None):
+    Args:
+        recompute: in the backward pass, instead of keeping activations (up to whoever calls it).
+    """
+
+    def __init__(self, res: ResBlock, attention: Attention | None, cross: Attention | None, recompute: bool):
         super().__init__()
         self.res = res
         self.attention = attention
         self.cross = cross
+        self.recompute = recompute
 
-    def forward(self, x: Tensor, embedding: Tensor | None, context: Tensor | None) -> Tensor:
+    def forward(
+        self, x: Tensor, skip: Tensor | None, embedding: Tensor | None, context: Tensor | KeyValue | None
+    ) -> Tensor:
+        if skip is not None:
+            x = torch.cat([x, skip], 1)
         x = self.res(x, embedding)
         if self.attention is not None:
             x = self.attention(x)
@@ -43,7 +66,11 @@ class UNet(nn.Module):
         with_time: condition on t.
         cross_attention: attend to the `features` of a U-Net of the same shape after every attention block.
         zero_output: start with zero output (right for a residual target, wrong for features).
-        checkpointing: recompute every stage in the backward pass instead of keeping its activations.
+        checkpointing: where the image is this many times smaller than the input, or everywhere (true), every stage is
+            recomputed in the backward pass instead of keeping its activations.
+
+    Raises:
+        ConfigError: `checkpointing` names a resolution that the U-Net does not have.
     """
 
     def __init__(
@@ -59,21 +86,24 @@ class UNet(nn.Module):
         with_time: bool,
         cross_attention: bool,
         zero_output: bool,
-        checkpointing: bool,
+        checkpointing: bool | Sequence[int],
     ):
         super().__init__()
         self.width = width
-        self.checkpointing = checkpointing
+        self.res_blocks = res_blocks
+        self.levels = len(channel_mult)
+        recomputed = levels_to_recompute(checkpointing, self.levels)
         embedding = 4 * width if with_time else None
         self.embed = None
         if with_time:
             self.embed = nn.Sequential(nn.Linear(width, embedding), nn.SiLU(), nn.Linear(embedding, embedding))
 
-        def stage(channels: int, out: int, attends: bool) -> Stage:
+        def stage(channels: int, out: int, level: int, attends: bool) -> Stage:
             return Stage(
                 ResBlock(channels, out, embedding, dropout),
                 Attention(out, head_channels, cross=False) if attends else None,
                 Attention(out, head_channels, cross=True) if attends and cross_attention else None,
+                level in recomputed,
             )
 
         channels = width
@@ -85,17 +115,16 @@ class UNet(nn.Module):
                 self.down.append(Downsample(channels))
                 skips.append(channels)
             for _ in range(res_blocks):
-                self.down.append(stage(channels, mult * width, 2**level in attention_downsampling))
+                self.down.append(stage(channels, mult * width, level, 2**level in attention_downsampling))
                 channels = mult * width
                 skips.append(channels)
-        self.middle = nn.ModuleList([stage(channels, channels, True), stage(channels, channels, False)])
+        self.middle = nn.ModuleList(stage(channels, channels, self.levels - 1, attends) for attends in (True, False))
         self.up = nn.ModuleList()
         for level, mult in reversed(list(enumerate(channel_mult))):
-            if level < len(channel_mult) - 1:
+            if level < self.levels - 1:
                 self.up.append(Upsample(channels))
             for _ in range(res_blocks + 1):
-                attends = 2**level in attention_downsampling
-                self.up.append(stage(channels + skips.pop(), mult * width, attends))
+                self.up.append(stage(channels + skips.pop(), mult * width, level, 2**level in attention_downsampling))
                 channels = mult * width
         self.norm_out = norm(channels)
         conv_out = nn.Conv2d(channels, out_channels, 3, padding=1)
@@ -105,40 +134,100 @@ class UNet(nn.Module):
         self,
         x: Float[Tensor, "batch in_channels height width"],
         t: Float[Tensor, "batch"] | None = None,
-        context: Sequence[Tensor] = (),
+        context: Context = (),
+        deep: DeepFeatures | None = None,
     ) -> tuple[Float[Tensor, "batch out_channels height width"], list[Tensor]]:
         """Output image, and the features after every attention block in order: the context of another U-Net.
 
         Args:
             t: times in [0, 1], if built `with_time`.
-            context: another U-Net's features, if built with `cross_attention`.
+            context: another U-Net's features, if built with `cross_attention`, or `keys_values` of them. They may be
+                of fewer scenes: x is then scenes · views images, scene by scene.
+            deep: what deep levels gave at an earlier call, to reuse; features are then those that were computed.
+
+        Raises:
+            ConfigError: `deep` is to begin below the last resolution.
         """
+        if deep is not None and deep.reuse.below >= self.levels:
+            raise ConfigError(f"deep.below={deep.reuse.below}: of {self.levels} resolutions none is left to reuse")
         embedding = None
         if self.embed is not None:
             embedding = self.embed(time_embedding(t, self.width).to(x.dtype))
-        context = iter(context)
+        attended = dict(zip(self._attending(), context, strict=True))
         features: list[Tensor] = []
 
-        def run(stage: Stage, h: Tensor) -> Tensor:
-            attended = next(context) if stage.cross is not None else None
-            if self.checkpointing and torch.is_grad_enabled():
-                h = checkpoint(stage, h, embedding, attended, use_reentrant=False)
-            else:
-                h = stage(h, embedding, attended)
+        def run(stage: Stage, h: Tensor, skip: Tensor | None = None) -> Tensor:
+            inputs = h, skip, embedding, attended.get(stage)
+            recompute = stage.recompute and torch.is_grad_enabled()
+            h = checkpoint(stage, *inputs, use_reentrant=False) if recompute else stage(*inputs)
             if stage.attention is not None:
                 features.append(h)
             return h
 
-        h = self.conv_in(x)
-        skips = [h]
-        for module in self.down:
-            h = run(module, h) if isinstance(module, Stage) else module(h)
-            skips.append(h)
-        for module in self.middle:
-            h = run(module, h)
-        for module in self.up:
-            if isinstance(module, Upsample):
-                h = module(h, skips[-1].shape[-2:])
+        def level(depth: int, h: Tensor) -> Tensor:
+            """All that happens at one resolution and below it: the U is a U within each of its levels."""
+            skips = [h]
+            for stage in self._down(depth):
+                h = run(stage, h)
+                skips.append(h)
+            if depth == self.levels - 1:
+                for stage in self.middle:
+                    h = run(stage, h)
+            elif deep is not None and deep.reuse.below == depth + 1:
+                if deep.due:
+                    deep.last = below(depth, h)
+                h = deep.last
             else:
-                h = run(module, torch.cat([h, skips.pop()], 1))
-        return self.conv_out(F.silu(self.norm_out(h))), features
+                h = below(depth, h)
+            for stage in self._up(depth):
+                h = run(stage, h, skips.pop())
+            return h
+
+        def below(depth: int, h: Tensor) -> Tensor:
+            down, up = self._between(depth)
+            return up(level(depth + 1, down(h)), h.shape[-2:])
+
+        h = level(0, self.conv_in(x))
+        return self.conv_out(norm_silu(self.norm_out, h)), features
+
+    def keys_values(self, context: Sequence[Tensor]) -> list[KeyValue]:
+        """What cross-attention looks up in a twin's features: a context of which nothing is left to compute."""
+        return [stage.cross.keys_values(features) for stage, features in zip(self._attending(), context, strict=True)]
+
+    def _attending(self) -> list[Stage]:
+        """The stages with cross-attention, in the order in which they run."""
+        stages = (module for part in (self.down, self.middle, self.up) for module in part)
+        return [stage for stage in stages if isinstance(stage, Stage) and stage.cross is not None]
+
+    def _down(self, level: int) -> list[Stage]:
+        start = level * (self.res_blocks + 1)
+        return list(self.down)[start : start + self.res_blocks]
+
+    def _up(self, level: int) -> list[Stage]:
+        start = (self.levels - 1 - level) * (self.res_blocks + 2)
+        return list(self.up)[start : start + self.res_blocks + 1]
+
+    def _between(self, level: int) -> tuple[Downsample, Upsample]:
+        """From a level to the next lower one, and back."""
+        down = self.down[level * (self.res_blocks + 1) + self.res_blocks]
+        return down, self.up[(self.levels - 1 - level) * (self.res_blocks + 2) - 1]
+
+
+def levels_to_recompute(checkpointing: bool | Sequence[int], levels: int) -> frozenset[int]:
+    """Numbers of the U-Net's resolutions, from 0 for the input's, whose activations are not kept.
+
+    Args:
+        checkpointing: of all (true), none (false), or those where the image is this many times smaller.
+
+    Raises:
+        ConfigError: there is no such resolution.
+    """
+    if isinstance(checkpointing, bool):
+        return frozenset(range(levels)) if checkpointing else frozenset()
+    known = {2**level: level for level in range(levels)}
+    if not set(checkpointing) <= known.keys():
+        raise ConfigError(
+            f"model.unet.checkpointing={list(checkpointing)} must be true, false, or some of {list(known)}: how many "
+            "times smaller than the input the images are whose activations are recomputed"
+        )
+    return frozenset(known[downsampling] for downsampling in checkpointing)

@@ -1,0 +1,93 @@
+"""GroupNorm, scale, shift and SiLU of images in channels_last, which are read twice and written once."""
+
+from typing import no_type_check
+
+import triton
+import triton.language as tl
+
+
+@triton.jit
+@no_type_check
+def sums_kernel(x, sums, pixels, C: tl.constexpr, CP: tl.constexpr, R: tl.constexpr, STEPS: tl.constexpr):
+    """Per channel, sum and sum of squares of x [images, pixels, C] less the image's first pixel, over R · STEPS pixels.
+
+    Less a pixel, as the square of a sum of numbers far from zero leaves little of their variance.
+
+    Args:
+        sums: [images, parts, 2, C] in fp32, out.
+    """
+    image, part = tl.program_id(0).to(tl.int64), tl.program_id(1)
+    x += image * pixels * C
+    channel = tl.arange(0, CP)
+    known = channel < C
+    pivot = tl.load(x + channel, mask=known, other=0.0).to(tl.float32)
+    first = tl.zeros([CP], tl.float32)
+    second = tl.zeros([CP], tl.float32)
+    for step in range(STEPS):
+        pixel = (part * STEPS + step) * R + tl.arange(0, R)
+        here = (pixel < pixels)[:, None] & known[None, :]
+        value = tl.load(x + pixel[:, None] * C + channel[None, :], mask=here, other=0.0).to(tl.float32)
+        value = tl.where(here, value - pivot[None, :], 0.0)
+        first += tl.sum(value, 0)
+        second += tl.sum(value * value, 0)
+    sums += (image * tl.num_programs(1) + part) * 2 * C
+    tl.store(sums + channel, first, mask=known)
+    tl.store(sums + C + channel, second, mask=known)
+
+
+@triton.jit
+@no_type_check
+def coefficients_kernel(
+    x, sums, weight, bias, scale_shift, coefficients, pixels, parts, eps,
+    MODULATED: tl.constexpr, GROUPS: tl.constexpr, SIZE: tl.constexpr, SP: tl.constexpr,
+):  # fmt: skip
+    """a and b of each channel, so that norm, scale and shift together are a x + b.
+
+    Args:
+        scale_shift: [images, 2, C], where MODULATED.
+        coefficients: [images, 2, C] in fp32, out.
+    """
+    image = tl.program_id(0).to(tl.int64)
+    C = GROUPS * SIZE
+    member = tl.arange(0, SP)[None, :]
+    channel = tl.arange(0, GROUPS)[:, None] * SIZE + member
+    known = (member < SIZE) & (channel < C)
+    pivot = tl.load(x + image * pixels * C + channel, mask=known, other=0.0).to(tl.float32)
+    first = tl.zeros([GROUPS, SP], tl.float32)
+    second = tl.zeros([GROUPS, SP], tl.float32)
+    sums += image * parts * 2 * C
+    for part in range(parts):
+        first += tl.load(sums + part * 2 * C + channel, mask=known, other=0.0)
+        second += tl.load(sums + part * 2 * C + C + channel, mask=known, other=0.0)
+    count = 1.0 * SIZE * pixels
+    mean = tl.sum(tl.where(known, first + pixels * pivot, 0.0), 1) / count
+    away = tl.where(known, mean[:, None] - pivot, 0.0)
+    variance = tl.sum(second - 2 * away * first + pixels * away * away, 1) / count
+    inverse = 1 / tl.sqrt(tl.maximum(variance, 0.0) + eps)
+    a = tl.load(weight + channel, mask=known, other=0.0).to(tl.float32) * inverse[:, None]
+    b = tl.load(bias + channel, mask=known, other=0.0).to(tl.float32) - mean[:, None] * a
+    if MODULATED:
+        scale_shift += image * 2 * C
+        scale = 1 + tl.load(scale_shift + channel, mask=known, other=0.0).to(tl.float32)
+        a *= scale
+        b = b * scale + tl.load(scale_shift + C + channel, mask=known, other=0.0).to(tl.float32)
+    coefficients += image * 2 * C
+    tl.store(coefficients + channel, a, mask=known)
+    tl.store(coefficients + C + channel, b, mask=known)
+
+
+@triton.jit
+@no_type_check
+def apply_kernel(x, coefficients, out, pixels, C: tl.constexpr, CP: tl.constexpr, R: tl.constexpr):
+    """SiLU of a x + b, for R pixels per program."""
+    image = tl.program_id(0).to(tl.int64)
+    channel = tl.arange(0, CP)
+    known = channel < C
+    coefficients += image * 2 * C
+    a = tl.load(coefficients + channel, mask=known, other=0.0)
+    b = tl.load(coefficients + C + channel, mask=known, other=0.0)
+    pixel = tl.program_id(1) * R + tl.arange(0, R)
+    here = (pixel < pixels)[:, None] & known[None, :]
+    at = image * pixels * C + pixel[:, None] * C + channel[None, :]
+    h = tl.load(x + at, mask=here, other=0.0).to(tl.float32) * a[None, :] + b[None, :]
+    tl.store(out + at, (h * tl.sigmoid(h)).to(out.dtype.element_ty), mask=here)

@@ -1,0 +1,156 @@
+"""Following the reverse process: DDIM, or DPM-Solver++(2M) in fewer steps, behind one interface.
+
+A sampler only ever sees denoised images. Whoever calls it may change them before each step, which is how views are
+guided: the guided x̃0 goes in where x0 does.
+"""
+
+import math
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfdiff.diffusion.ddim import Images, ddim_step
+from nerfdiff.diffusion.schedule import alpha_sigma
+from nerfdiff.errors import ConfigError
+
+
+@runtime_checkable
+class Sampler(Protocol):
+    """One run of the reverse process; it may remember its earlier steps, so every run has its own."""
+
+    needs_noise: bool
+    """Whether steps want fresh noise."""
+
+    def step(self, z: Images, x0: Images, t: Tensor, t_next: Tensor, noise: Images | None) -> Images:
+        """From Z_t to Z_{t_next}.
+
+        Args:
+            x0: the denoised images, guided or not.
+            t, t_next: scalars, t > t_next; each call begins at the t_next of the last.
+            noise: standard normal where `needs_noise`.
+        """
+
+
+class DDIM:
+    """Song et al. 2020; first order in the step.
+
+    Args:
+        eta: 0 is deterministic, 1 is ancestral sampling.
+    """
+
+    def __init__(self, eta: float):
+        self.eta = eta
+        self.needs_noise = eta > 0
+
+    def step(self, z: Images, x0: Images, t: Tensor, t_next: Tensor, noise: Images | None) -> Images:
+        return ddim_step(z, x0, t, t_next, self.eta, noise)
+
+
+class DPMSolverPP2M:
+    """DPM-Solver++(2M) (Lu et al. 2022, arXiv 2211.01095, algorithm 2); deterministic, second order in the step.
+
+    Its step, (σ'/σ) Z − α' (e^{−h} − 1) D with h = λ' − λ and λ = log(α/σ), is DDIM's with D for x0: the line through
+    this and the last x0 over λ, half a step ahead. As long as there is no line, D is x0: in the first step, in the
+    second after t = 1 (λ = −∞), and in the last to t = 0 (λ = ∞). There both methods are one, and finite.
+    """
+
+    needs_noise = False
+
+    def __init__(self):
+        self._last: tuple[Images, Tensor] | None = None
+
+    def step(self, z: Images, x0: Images, t: Tensor, t_next: Tensor, noise: Images | None) -> Images:
+        ahead = x0
+        if self._last is not None:
+            last_x0, last_t = self._last
+            # 1 / (2r) of the paper, r = h_last / h
+            share = 0.5 * (half_log_snr(t_next) - half_log_snr(t)) / (half_log_snr(t) - half_log_snr(last_t))
+            ahead = x0 + torch.where(share.isfinite(), share, 0.0) * (x0 - last_x0)
+        self._last = x0, t
+        return ddim_step(z, ahead, t, t_next, 0.0, None)
+
+
+def half_log_snr(t: Tensor) -> Tensor:
+    """λ = log(α/σ), from ∞ at t = 0 to −∞ at t = 1."""
+    alpha, sigma = alpha_sigma(t)
+    return alpha.log() - sigma.log()
+
+
+SAMPLERS = ("ddim", "dpmpp_2m")
+SPACINGS = ("uniform_t", "uniform_lambda")
+
+
+def make_sampler(name: str, eta: float) -> Sampler:
+    """A sampler for one run.
+
+    Args:
+        name: `ddim` or `dpmpp_2m`.
+        eta: of DDIM; `dpmpp_2m` is deterministic and takes 0 only.
+
+    Raises:
+        ConfigError: another name, or an eta that cannot be.
+    """
+    if name not in SAMPLERS:
+        raise ConfigError(f"sampler={name!r}: choose {' or '.join(SAMPLERS)}")
+    if not eta >= 0:
+        raise ConfigError(f"eta={eta} must be at least 0")
+    if name == "dpmpp_2m" and eta > 0:
+        raise ConfigError(f"sampler=dpmpp_2m is deterministic and takes eta=0, got eta={eta}; sampler=ddim takes both")
+    return DDIM(eta) if name == "ddim" else DPMSolverPP2M()
+
+
+def time_steps(n: int, t_max: float, t_min: float, spacing: str, device=None) -> Float[Tensor, "{n}+1"]:
+    """n + 1 times from t_max down to t_min.
+
+    Args:
+        spacing: `uniform_t`; or `uniform_lambda`, evenly over λ = log(α/σ), which suits DPM-Solver++ in few steps. λ is
+            infinite at t = 1 and t = 0: the steps from and to there go as far in t as 1/n² of the way, which leaves
+            them an error that falls as fast as the others'.
+
+    Raises:
+        ConfigError: not 0 <= t_min < t_max <= 1, n < 1, or another spacing.
+    """
+    if not 0 <= t_min < t_max <= 1 or n < 1:
+        raise ConfigError(f"t_min={t_min}, t_max={t_max}, steps={n}: need 0 <= t_min < t_max <= 1 and steps >= 1")
+    if spacing not in SPACINGS:
+        raise ConfigError(f"spacing={spacing!r}: choose {' or '.join(SPACINGS)}")
+    if spacing == "uniform_t":
+        return torch.linspace(t_max, t_min, n + 1, dtype=torch.float64, device=device).float()
+    from_noise, to_images = t_max == 1, t_min == 0
+    short = (t_max - t_min) / n**2
+    finite = torch.tensor([t_max - short * from_noise, t_min + short * to_images], dtype=torch.float64)
+    inner = n + 1 - from_noise - to_images
+    share = torch.linspace(0, 1, inner, dtype=torch.float64) if inner > 1 else torch.full((inner,), 0.5).double()
+    between = 2 / math.pi * torch.atan(torch.exp(-torch.lerp(*half_log_snr(finite), share)))
+    times = torch.cat([between.new_ones(int(from_noise)), between, between.new_zeros(int(to_images))])
+    times[0], times[-1] = t_max, t_min  # exactly
+    return times.float().to(device)
+
+
+def sample(
+    denoise: Callable[[Images, Tensor], Images],
+    z: Images,
+    times: Float[Tensor, "times"],
+    sampler: Sampler,
+    noise: Callable[[], Images] | None = None,
+) -> Images:
+    """Follow the reverse process along `times` and return the last denoised images.
+
+    Args:
+        denoise: (Z_t, t as a scalar) to x0.
+        z: the noise at times[0].
+        times: descending, one more than there are steps.
+        sampler: a fresh one.
+        noise: makes fresh standard normal images, where the sampler needs them.
+
+    Returns:
+        x0 at the last step, which equals Z at times[-1] = 0.
+    """
+    for t, t_next in pairwise(times):
+        x0 = denoise(z, t)
+        z = sampler.step(z, x0, t, t_next, noise() if sampler.needs_noise else None)
+    return x0

@@ -102,11 +102,11 @@ def test_the_field_in_the_file_is_the_one_whose_views_were_saved(precision, data
 def test_scenes_that_are_done_are_not_made_again(data, run, tmp_path, monkeypatch):
     predict, calls = Distillation.predict, []
 
-    def stopped_at_the_second(self, model, scene, *more):
-        calls.append(scene.scene_ids[0])
+    def stopped_at_the_second(self, model, scenes, *more):
+        calls.extend(scene.scene_ids[0] for scene in scenes)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return predict(self, model, scene, *more)
+        return predict(self, model, scenes, *more)
 
     monkeypatch.setattr(Distillation, "predict", stopped_at_the_second)
     with pytest.raises(KeyboardInterrupt):
@@ -115,12 +115,25 @@ def test_scenes_that_are_done_are_not_made_again(data, run, tmp_path, monkeypatc
     assert calls == ["scene0", "scene1", "scene1"] and row.n_scenes == 2
 
 
+def test_scenes_fitted_together_are_what_they_are_alone(data, run, tmp_path):
+    pixels = {}
+    for count in (1, 2):
+        row = distill(config(data, run, tmp_path / str(count), f"scenes_at_once={count}"))
+        assert row.status == "ok" and row.n_scenes == 2
+        folder = scene_folder(tmp_path / str(count), "ngd", "scene1")
+        pixels[count] = read_prediction(folder.parent, "scene1").pixels.int()
+    assert (pixels[1] - pixels[2]).abs().max() <= 2
+    with pytest.raises(ConfigError, match="scenes_at_once=0 must be at least 1"):
+        distill(config(data, run, tmp_path / "none", "scenes_at_once=0"))
+
+
 def test_a_scene_that_fell_back_says_so(data, run, tmp_path, monkeypatch):
     fit = NGDModule._fit
 
     def poisoned(self, targets):
-        if self.views.seed[-1] == "scene1" and len(self.trace) == 1:
-            targets = targets * float("nan")
+        if len(self._records) == 1:
+            sick = [views.seed[-1] == "scene1" for views in self.views]
+            targets = targets * torch.where(torch.tensor(sick), float("nan"), 1.0).reshape(-1, 1, 1, 1, 1)
         return fit(self, targets)
 
     monkeypatch.setattr(NGDModule, "_fit", poisoned)
@@ -131,7 +144,7 @@ def test_a_scene_that_fell_back_says_so(data, run, tmp_path, monkeypatch):
             "scene0": "ok",
             "scene1": "non-finite",
         }
-    assert load_field(scene_folder(tmp_path, "ngd", "scene1") / FIELD).field.is_finite()
+    assert load_field(scene_folder(tmp_path, "ngd", "scene1") / FIELD).field.finite().all()
 
 
 def test_a_failure_is_a_row(data, run, tmp_path, monkeypatch):
@@ -208,7 +221,7 @@ def test_no_method_sees_the_truth(strategy, data, run, tmp_path):
     subject = dataset_subject(cfg, torch.device("cpu"))
     (scene,) = subject.load(["scene0"])
     other = dataclasses.replace(scene, target_pixels=255 - scene.target_pixels, target_depth=None, target_mask=None)
-    first, second = (instantiate(cfg.strategy).predict(subject.model, batch, 0) for batch in (scene, other))
+    first, second = (instantiate(cfg.strategy).predict(subject.model, [batch], 0)[0] for batch in (scene, other))
     assert torch.equal(first.images, second.images)
 
 

@@ -100,11 +100,11 @@ def test_the_same_evaluation_predicts_nothing_twice(data, run, tmp_path, monkeyp
 def test_a_killed_evaluation_goes_on_at_the_next_scene(data, run, tmp_path, monkeypatch):
     predict, calls = SingleImageNeRF.predict, []
 
-    def fail_at_the_second(self, model, scene, *more):
-        calls.append(scene.scene_ids[0])
+    def fail_at_the_second(self, model, scenes, *more):
+        calls.extend(scene.scene_ids[0] for scene in scenes)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return predict(self, model, scene, *more)
+        return predict(self, model, scenes, *more)
 
     monkeypatch.setattr(SingleImageNeRF, "predict", fail_at_the_second)
     settings = config(data, run, tmp_path, "orbit.scenes=0")
@@ -119,9 +119,9 @@ def test_a_failure_is_a_row(data, run, tmp_path, monkeypatch):
     predict = SingleImageNeRF.predict
 
     def broken(self, *arguments):
-        views = predict(self, *arguments)
+        (views,) = predict(self, *arguments)
         views.images[0, 0, 0, 0] = float("nan")
-        return views
+        return [views]
 
     monkeypatch.setattr(SingleImageNeRF, "predict", broken)
     with pytest.raises(NonFinitePrediction):

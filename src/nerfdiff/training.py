@@ -1,6 +1,7 @@
 """One training run, from a composed config to a model on disk."""
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerfdiff.callbacks.checkpoint import ClearCheckpointIO
 from nerfdiff.checkpoint import check_resumable, export_model, last_checkpoint, load_model
+from nerfdiff.compilation import compile_unets
 from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.errors import CheckpointError, ConfigError
 from nerfdiff.memory import WEIGHTS_ADAM_EMA, is_tight, require_memory
@@ -52,6 +54,8 @@ def train(cfg: DictConfig) -> dict[str, float]:
         channels_last=cfg.channels_last,
         seed=cfg.seed,
     )
+    module.model.renderer = replace(module.model.renderer, backend=cfg.backend)
+    compile_unets(module.model, cfg.compile, cfg.paths.compiled_dir)
     if trainer.is_global_zero:
         output_dir.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(cfg, output_dir / "config.yaml", resolve=True)
@@ -75,7 +79,8 @@ def _require_memory(model_config: dict, trainer: Trainer, data: SceneDataModule)
         return
     first = data.reader("train").load(0, [0]).cameras
     batch_size = max(1, data.batch_size // (trainer.world_size * trainer.accumulate_grad_batches))
-    require_memory(model_config, device, batch_size, data.target_views, first.height, first.width)
+    size = first.height, first.width
+    require_memory(model_config, device, batch_size, data.target_views, *size, trainer.precision)
 
 
 def build_trainer(cfg: DictConfig) -> Trainer:

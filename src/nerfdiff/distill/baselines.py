@@ -22,8 +22,10 @@ class CopyInput:
 
     name: str = "copy_input"
 
-    def predict(self, model: NerfDiff | None, scene: ViewBatch, seed: int, callbacks: Sequence[Callback] = ()) -> Views:
-        return Views(scene.source.expand(scene.targets.shape[1], -1, -1, -1))
+    def predict(
+        self, model: NerfDiff | None, scenes: Sequence[ViewBatch], seed: int, callbacks: Sequence[Callback] = ()
+    ) -> list[Views]:
+        return [Views(scene.source.expand(scene.targets.shape[1], -1, -1, -1)) for scene in scenes]
 
 
 @dataclass(frozen=True)
@@ -33,9 +35,14 @@ class MeanImage:
     mean: Float[Tensor, "3 height width"]
     name: str = "mean_image"
 
-    def predict(self, model: NerfDiff | None, scene: ViewBatch, seed: int, callbacks: Sequence[Callback] = ()) -> Views:
-        mean = F.interpolate(self.mean[None], scene.targets.shape[-2:], mode="area")
-        return Views(mean.expand(scene.targets.shape[1], -1, -1, -1).to(scene.source))
+    def predict(
+        self, model: NerfDiff | None, scenes: Sequence[ViewBatch], seed: int, callbacks: Sequence[Callback] = ()
+    ) -> list[Views]:
+        def views(scene: ViewBatch) -> Views:
+            mean = F.interpolate(self.mean[None], scene.targets.shape[-2:], mode="area")
+            return Views(mean.expand(scene.targets.shape[1], -1, -1, -1).to(scene.source))
+
+        return [views(scene) for scene in scenes]
 
 
 def mean_training_image(reader: SceneReader, scenes: int, seed: int) -> Float[Tensor, "3 height width"]:

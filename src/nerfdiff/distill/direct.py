@@ -1,5 +1,6 @@
 """Direct distillation: every view sampled once by itself, and the field fitted to what came out (paper, appendix)."""
 
+from nerfdiff.diffusion.deep_features import DeepReuse
 from nerfdiff.distill.cdm import sample_views
 from nerfdiff.distill.fixed_images import FixedImages
 from nerfdiff.distill.virtual_views import VirtualViews
@@ -11,9 +12,20 @@ class SampledViews(FixedImages):
     Args:
         views: to sample.
         steps: how many times targets are asked for, to fit as long as the other methods do.
-        sampler_steps: DDIM steps from `t_max` to `t_min`.
-        eta: DDIM's η.
+        sampler_steps: diffusion steps from `t_max` to `t_min`.
+        spacing, sampler, eta, deep: as for `sample_views`.
     """
 
-    def __init__(self, views: VirtualViews, steps: int, sampler_steps: int, t_max: float, t_min: float, eta: float):
-        super().__init__(sample_views(views, sampler_steps, t_max, t_min, eta), steps)
+    def __init__(
+        self,
+        views: VirtualViews,
+        steps: int,
+        sampler_steps: int,
+        t_max: float,
+        t_min: float,
+        spacing: str,
+        sampler: str,
+        eta: float,
+        deep: DeepReuse | None = None,
+    ):
+        super().__init__(sample_views(views, sampler_steps, t_max, t_min, spacing, sampler, eta, deep), steps)

@@ -1,4 +1,4 @@
-"""A field fine-tuned for one scene at test time, by any teacher, then rendered: strategies `ngd`, `direct`, `sds`."""
+"""Fields fine-tuned for scenes at test time, by any teacher, then rendered: strategies `ngd`, `direct`, `sds`."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -15,6 +15,8 @@ from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.distill.strategy import Views
 from nerfdiff.distill.teacher import MakeTeacher
 from nerfdiff.distill.virtual_views import VirtualViews
+from nerfdiff.errors import ConfigError
+from nerfdiff.field.triplane import Triplane
 from nerfdiff.model import NerfDiff
 from nerfdiff.modules.ngd_module import NGDModule
 
@@ -33,7 +35,9 @@ class Distillation:
         lr_planes, lr_decoder: learning rates of W and θ.
         lr_decay: of both, as the steps go by: `none`, `linear` or `cosine`.
         fit_source: whether the input image is fitted beside the virtual views.
-        source_tolerance: dB by which the input view may get worse before the scene falls back to its first field.
+        target_tolerance, source_tolerance: dB by which the last targets and the input view may be explained worse
+            before a scene falls back to its first field.
+        cuda_graphs: record an inner step once and replay it, on a GPU.
         views_at_once: views denoised in one batch, which bounds memory.
     """
 
@@ -46,44 +50,65 @@ class Distillation:
     lr_decoder: float
     lr_decay: str
     fit_source: bool
+    target_tolerance: float
     source_tolerance: float
+    cuda_graphs: bool
     views_at_once: int
 
-    def predict(self, model: NerfDiff, scene: ViewBatch, seed: int, callbacks: Sequence[Callback] = ()) -> Views:
-        module = self.distil(model, scene, seed, callbacks)
-        return Views.of_field(
-            SavedField(module.field, model.renderer),
-            scene.target_cameras,
-            module.views.denoiser_calls,
-            module.views.field_queries,
-            module.trace,
-            module.status,
-        )
+    def predict(
+        self, model: NerfDiff, scenes: Sequence[ViewBatch], seed: int, callbacks: Sequence[Callback] = ()
+    ) -> list[Views]:
+        module = self.distil(model, scenes, seed, callbacks)
+        return [
+            Views.of_field(
+                SavedField(module.field.alone(number), model.renderer),
+                scene.target_cameras,
+                module.views[number].denoiser_calls,
+                module.views[number].field_queries,
+                module.trace(number),
+                module.statuses[number],
+            )
+            for number, scene in enumerate(scenes)
+        ]
 
-    def distil(self, model: NerfDiff, scene: ViewBatch, seed: int, callbacks: Sequence[Callback] = ()) -> NGDModule:
-        """The fine-tuned field of a batch of one scene, with its trace and status.
+    def distil(
+        self, model: NerfDiff, scenes: Sequence[ViewBatch], seed: int, callbacks: Sequence[Callback] = ()
+    ) -> NGDModule:
+        """The fine-tuned fields of scenes, distilled together, with their traces and statuses.
 
         Args:
-            callbacks: of the Trainer that fits it.
+            scenes: batches of one, with images of one size.
+            callbacks: of the Trainer that fits them.
+
+        Raises:
+            ConfigError: scenes that do not fit into one batch.
         """
-        purpose = (seed, "distil", *scene.scene_ids)
+        if len({scene.source.shape for scene in scenes}) > 1:
+            raise ConfigError("scenes whose images differ in size cannot be distilled together: set scenes_at_once=1")
+        seeds = [(seed, "distil", *scene.scene_ids) for scene in scenes]
         with torch.no_grad():
-            encoding = model.encode(scene.source, scene.source_cameras, scene.near, scene.far)
-        views = VirtualViews(model, encoding, self.prior(scene), self.views_at_once, purpose)
+            # One by one, so that a scene's numbers do not depend on its company.
+            encodings = [model.encode(s.source, s.source_cameras, s.near, s.far) for s in scenes]
+        views = [
+            VirtualViews(model, encoding, self.prior(scene), self.views_at_once, own)
+            for encoding, scene, own in zip(encodings, scenes, seeds, strict=True)
+        ]
         module = NGDModule(
-            RefinedField(encoding.triplane, model.decoder),
+            RefinedField(Triplane.join([encoding.triplane for encoding in encodings]), model.decoder),
             views,
-            self.teacher(views),
+            [self.teacher(v) for v in views],
             self.inner_steps,
             self.rays,
             self.lr_planes,
             self.lr_decoder,
             self.lr_decay,
             self.fit_source,
+            self.target_tolerance,
             self.source_tolerance,
-            purpose,
+            self.cuda_graphs,
+            seeds,
         )
-        device = scene.source.device
+        device = scenes[0].source.device
         with torch.enable_grad(), _hushed("lightning.pytorch"):
             trainer = Trainer(
                 max_epochs=1,
@@ -97,8 +122,9 @@ class Distillation:
             )
             trainer.fit(module)
         module.to(device)
-        if module.status != "ok":
-            log.warning("%s of scene %s fell back: %s", self.name, scene.scene_ids[0], module.status)
+        for scene, status in zip(scenes, module.statuses, strict=True):
+            if status != "ok":
+                log.warning("%s of scene %s fell back: %s", self.name, scene.scene_ids[0], status)
         return module
 
 

@@ -20,7 +20,12 @@ class SingleImageNeRF:
     name: str
 
     @torch.no_grad()
-    def predict(self, model: NerfDiff, scene: ViewBatch, seed: int, callbacks: Sequence[Callback] = ()) -> Views:
-        encoding = model.encode(scene.source, scene.source_cameras, scene.near, scene.far)
-        field = RefinedField(encoding.triplane, model.decoder)
-        return Views.of_field(SavedField(field, model.renderer), scene.target_cameras)
+    def predict(
+        self, model: NerfDiff, scenes: Sequence[ViewBatch], seed: int, callbacks: Sequence[Callback] = ()
+    ) -> list[Views]:
+        predicted = []
+        for scene in scenes:
+            encoding = model.encode(scene.source, scene.source_cameras, scene.near, scene.far)
+            field = RefinedField(encoding.triplane, model.decoder)
+            predicted.append(Views.of_field(SavedField(field, model.renderer), scene.target_cameras))
+        return predicted

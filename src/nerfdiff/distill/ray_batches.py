@@ -1,45 +1,37 @@
-"""Random rays over all virtual views, with the colours they should have."""
+"""The rays of all virtual views, with the colours they should have, from which random ones are drawn."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras, Rays
 
 
 class RayBatches:
-    """Rays of K cameras laid out in one row, and draws from it (paper: "rays with batch size B from all views").
+    """Rays of K cameras of each scene laid out in one row, made once (paper: "batch size B from all views").
 
     Args:
-        cameras: [1, K], in the input camera's space.
-        near, far: of the scene.
-        images: targets in [0, 1], one per camera.
-        generator: of the draws.
+        cameras: [scenes, K], in the space of each scene's input camera.
+        near, far: of each scene.
     """
 
-    def __init__(
-        self,
-        cameras: Cameras,
-        near: Float[Tensor, "1"],
-        far: Float[Tensor, "1"],
-        images: Float[Tensor, "views 3 height width"],
-        generator: torch.Generator,
-    ):
+    def __init__(self, cameras: Cameras, near: Float[Tensor, "scenes"], far: Float[Tensor, "scenes"]):
         rays = cameras.rays(near[:, None], far[:, None])
-        shape = rays.directions.shape[:-1]
-        self.rays = Rays(
-            rays.origins.reshape(1, -1, 3),
-            rays.directions.reshape(1, -1, 3),
-            rays.near.expand(shape).reshape(1, -1),
-            rays.far.expand(shape).reshape(1, -1),
-        )
-        self.colours = images.movedim(1, -1).reshape(1, -1, 3)
-        self.generator = generator
+        scenes, per_scene = len(near), rays.directions[0, ..., 0].numel()
+        self.shape = scenes, per_scene
+        bounds = [bound.expand(rays.directions.shape[:-1])[..., None] for bound in (rays.near, rays.far)]
+        colours = torch.zeros_like(rays.directions)
+        # One row per ray, so that drawing is one gather: origin, direction, colour, near, far.
+        table = torch.cat([rays.origins.expand_as(colours), rays.directions, colours, *bounds], -1)
+        self._table = table.reshape(scenes * per_scene, -1)
+        self._first = per_scene * torch.arange(scenes, device=near.device)[:, None]
 
-    def draw(self, count: int, samples: int) -> tuple[Rays, Float[Tensor, "1 {count} 3"], Tensor]:
-        """`count` random rays, their colours, and jitter for `samples` samples on each."""
-        device = self.colours.device
-        picked = torch.randint(self.colours.shape[1], (count,), generator=self.generator, device=device)
-        rays = Rays(*(part[:, picked] for part in vars(self.rays).values()))
-        jitter = torch.rand(1, count, samples, generator=self.generator, device=device)
-        return rays, self.colours[:, picked], jitter
+    def paint(self, images: Float[Tensor, "scenes views 3 height width"]) -> None:
+        """The colours that the rays should have from now on, in [0, 1]: one image per camera."""
+        self._table[:, 6:9] = images.movedim(2, -1).reshape(-1, 3)
+
+    def at(self, picked: Int64[Tensor, "scenes n"]) -> tuple[Rays, Float[Tensor, "scenes n 3"]]:
+        """Rays by their numbers within their scenes, and their colours."""
+        rows = self._table[picked + self._first]
+        origins, directions, colours, near, far = rows.split([3, 3, 3, 1, 1], -1)
+        return Rays(origins, directions, near[..., 0], far[..., 0]), colours

@@ -1,8 +1,7 @@
 """The field that is fine-tuned at test time: triplane and decoder as parameters, in the input camera's space."""
 
-import copy
-
 import torch
+from jaxtyping import Bool
 from torch import Tensor, nn
 
 from nerfdiff.cameras import Cameras
@@ -13,38 +12,67 @@ from nerfdiff.render.renderer import Renderer, Rendering
 
 
 class RefinedField(nn.Module):
-    """W and f_θ of one scene, copied, so that fitting them changes nothing else.
+    """W and f_θ of one scene, or of several with a decoder each, copied, so that fitting them changes nothing else.
 
     Args:
-        triplane: of a batch of one scene.
+        triplane: of a batch of scenes.
     """
 
     def __init__(self, triplane: Triplane, decoder: Decoder):
         super().__init__()
         self.planes = nn.Parameter(triplane.planes.detach().float().clone())
-        self.decoder = copy.deepcopy(decoder).float().requires_grad_(True).train()
+        self.decoder = decoder.for_scenes(len(self.planes)).float().requires_grad_(True).train()
         self._size = triplane.cameras.height, triplane.cameras.width
         # the frustum moves with the module, and is no part of what is fitted
         for name, value in (("K", triplane.cameras.K), ("near", triplane.near), ("far", triplane.far)):
             self.register_buffer(name, value.clone(), persistent=False)
 
+    def __len__(self) -> int:
+        return len(self.planes)
+
     @property
     def cameras(self) -> Cameras:
-        """The input camera [1], in whose space points are given."""
-        return Cameras(torch.eye(4, device=self.K.device)[None], self.K, *self._size)
+        """The input cameras [scenes], in whose space points are given."""
+        return Cameras(torch.eye(4, device=self.K.device).expand(len(self), 4, 4), self.K, *self._size)
+
+    @property
+    def triplane(self) -> Triplane:
+        """W."""
+        return Triplane(self.planes, self.cameras, self.near, self.far)
 
     def field(self) -> TriplaneField:
         """Colour and density of points in the input camera's space."""
-        return TriplaneField(Triplane(self.planes, self.cameras, self.near, self.far), self.decoder)
+        return TriplaneField(self.triplane, self.decoder)
 
     def render(self, renderer: Renderer, cameras: Cameras) -> Rendering:
-        """Whole images of cameras [1, views]: leading shape [1, views, height, width]."""
+        """Whole images of cameras [scenes, views]: leading shape [scenes, views, height, width]."""
         return renderer.render_views(self.field(), cameras, self.near, self.far)
 
-    def snapshot(self) -> dict[str, Tensor]:
-        """A copy of the parameters, to return to with `load_state_dict`."""
-        return {name: value.clone() for name, value in self.state_dict().items()}
+    def alone(self, scene: int) -> "RefinedField":
+        """One scene's field, copied."""
+        own = slice(scene, scene + 1)
+        triplane = Triplane(self.planes[own], self.cameras[own], self.near[own], self.far[own])
+        return RefinedField(triplane, self.decoder.of_scene(scene))
 
-    def is_finite(self) -> bool:
-        """Whether every parameter is a number."""
-        return all(bool(torch.isfinite(parameter).all()) for parameter in self.parameters())
+    @torch.no_grad()
+    def snapshot(self) -> dict[str, Tensor]:
+        """A copy of the parameters, to return to with `restore`."""
+        return {name: value.detach().clone() for name, value in self.named_parameters()}
+
+    @torch.no_grad()
+    def restore(self, snapshot: dict[str, Tensor], scenes: Bool[Tensor, "scenes"]) -> None:
+        """Put the parameters of those scenes back to what they were."""
+        chosen = choose(scenes, snapshot, self.snapshot())
+        for name, value in self.named_parameters():
+            value.copy_(chosen[name])
+
+    def finite(self) -> Bool[Tensor, "scenes"]:
+        """Of which scenes every parameter is a number."""
+        return torch.stack([torch.isfinite(value).reshape(len(self), -1).all(1) for value in self.parameters()]).all(0)
+
+
+def choose(scenes: Bool[Tensor, "scenes"], snapshot: dict[str, Tensor], other: dict[str, Tensor]) -> dict[str, Tensor]:
+    """One snapshot's parameters for those scenes, another's for the rest; the device decides, and nobody waits."""
+    # a parameter's first axis is the scenes' where there are several
+    flags = {name: scenes.reshape(-1, *[1] * (value.ndim - 1)) for name, value in snapshot.items()}
+    return {name: torch.where(flags[name], value, other[name]) for name, value in snapshot.items()}

@@ -4,8 +4,8 @@ from itertools import pairwise
 
 import torch
 
-from nerfdiff.diffusion.ddim import ddim_step, time_steps
 from nerfdiff.diffusion.denoiser import Condition
+from nerfdiff.diffusion.sampler import make_sampler, time_steps
 from nerfdiff.distill.fixed_images import FixedImages
 from nerfdiff.distill.virtual_views import VirtualViews
 from nerfdiff.field.encoder import Encoding
@@ -23,19 +23,35 @@ class AutoregressiveViews(FixedImages):
     Args:
         views: to make, in their order.
         steps: how many times targets are asked for.
-        sampler_steps: DDIM steps from `t_max` to `t_min`.
+        sampler_steps: diffusion steps from `t_max` to `t_min`.
+        spacing: of the times, `uniform_t` or `uniform_lambda`.
+        sampler: `ddim` or `dpmpp_2m`.
         eta: DDIM's η.
+
+    Raises:
+        ConfigError: another sampler or spacing, or times or an eta that cannot be.
     """
 
     @torch.no_grad()
-    def __init__(self, views: VirtualViews, steps: int, sampler_steps: int, t_max: float, t_min: float, eta: float):
+    def __init__(
+        self,
+        views: VirtualViews,
+        steps: int,
+        sampler_steps: int,
+        t_max: float,
+        t_min: float,
+        spacing: str,
+        sampler: str,
+        eta: float,
+    ):
         model, encodings = views.model, [views.encoding]
         frustum = views.encoding.triplane
         choice = generator("cpu", *views.seed, "stochastic conditioning")
-        times = time_steps(sampler_steps, t_max, t_min, device=views.encoding.source.device)
+        times = time_steps(sampler_steps, t_max, t_min, spacing, device=views.encoding.source.device)
         images = []
         for view in range(len(views)):
             conditions: dict[int, Condition] = {}
+            run = make_sampler(sampler, eta)
             z = views.noise_of(view)[None]
             for t, t_next in pairwise(times):
                 known = int(torch.randint(len(encodings), (), generator=choice))
@@ -44,7 +60,7 @@ class AutoregressiveViews(FixedImages):
                     views.field_queries += model.renderer.samples_per_ray * z[0, 0].numel()
                 x0 = model.denoiser(z, t[None], conditions[known]).clamp(-1, 1)
                 views.denoiser_calls += 1
-                z = ddim_step(z, x0, t, t_next, eta, views.noise_of(view)[None] if eta > 0 else None)
+                z = run.step(z, x0, t, t_next, views.noise_of(view)[None] if run.needs_noise else None)
             images.append(0.5 * (x0 + 1))
             encodings.append(model.encode(images[-1], frustum.cameras, frustum.near, frustum.far))
         super().__init__(torch.cat(images), steps)

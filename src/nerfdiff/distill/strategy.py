@@ -75,10 +75,13 @@ class Strategy(Protocol):
 
     name: str
 
-    def predict(self, model: NerfDiff | None, scene: ViewBatch, seed: int, callbacks: Sequence[Callback] = ()) -> Views:
-        """Images of every target view of `scene`, a batch of one scene, from its source view alone.
+    def predict(
+        self, model: NerfDiff | None, scenes: Sequence[ViewBatch], seed: int, callbacks: Sequence[Callback] = ()
+    ) -> list[Views]:
+        """Images of every target view of each of `scenes`, from its source view alone, whatever the other scenes.
 
         Args:
             model: frozen; baselines that use none take None.
-            callbacks: of the Lightning Trainer that fits a field, where the method has one.
+            scenes: batches of one.
+            callbacks: of the Lightning Trainer that fits fields, where the method has one.
         """

@@ -1,5 +1,6 @@
 """K virtual views of one scene, and the frozen CDM that denoises them."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -7,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras
+from nerfdiff.diffusion.deep_features import DeepFeatures, DeepReuse
 from nerfdiff.diffusion.denoiser import Condition
 from nerfdiff.field.encoder import Encoding
 from nerfdiff.model import NerfDiff
@@ -30,7 +32,8 @@ class VirtualViews:
     def __init__(
         self, model: NerfDiff, encoding: Encoding, cameras: Cameras, views_at_once: int, seed: tuple[int | str, ...]
     ):
-        self.model, self.encoding, self.cameras, self.seed = model, encoding, cameras, seed
+        self.model, self.cameras, self.seed = model, cameras, seed
+        self.encoding = encoding = model.settled(encoding)
         self._parts = torch.arange(cameras.shape[1]).split(views_at_once)
         self._conditions: list[Condition] = []
         for part in self._parts:
@@ -48,20 +51,32 @@ class VirtualViews:
         """The single-image NeRF's images of all views, in [0, 1]."""
         return torch.cat([condition.rendered for condition in self._conditions])
 
+    def reusing(self, deep: DeepReuse | None) -> list[DeepFeatures] | None:
+        """For `denoise` along one reverse process; None where all is computed."""
+        return None if deep is None or deep.every == 1 else [DeepFeatures(deep) for _ in self._parts]
+
     @torch.no_grad()
-    def denoise(self, z: Images, t: Float[Tensor, "views"], rendered: Images | None = None) -> Images:
+    def denoise(
+        self,
+        z: Images,
+        t: Float[Tensor, "views"],
+        rendered: Images | None = None,
+        deep: Sequence[DeepFeatures] | None = None,
+    ) -> Images:
         """x0 of every view, clamped to [-1, 1] as images are.
 
         Args:
             t: of each view.
             rendered: what the CDM is conditioned on, in [0, 1]; None: the first renderings.
+            deep: `reusing`, where calls follow each other along one reverse process; None computes all.
         """
         self.denoiser_calls += len(z)
         x0 = []
-        for part, condition in zip(self._parts, self._conditions, strict=True):
+        deep = [None] * len(self._parts) if deep is None else deep
+        for part, condition, kept in zip(self._parts, self._conditions, deep, strict=True):
             if rendered is not None:
                 condition = replace(condition, rendered=rendered[part])
-            x0.append(self.model.denoiser(z[part], t[part], condition))
+            x0.append(self.model.denoiser(z[part], t[part], condition, kept))
         return torch.cat(x0).clamp(-1, 1)
 
     def noise(self) -> Images:

@@ -3,14 +3,13 @@
 import json
 import resource
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import torch
-from lightning import Callback
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -19,6 +18,7 @@ from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.field_file import FIELD, SavedField, load_field, save_field
 from nerfdiff.distill.strategy import Strategy, Views
 from nerfdiff.distill.trace import PLOT, TRACE, plot_trace, write_trace
+from nerfdiff.errors import ConfigError
 from nerfdiff.evaluation.subject import Subject
 from nerfdiff.metrics.image import psnr
 from nerfdiff.metrics.predictions import SCENE, PredictionWriter
@@ -30,7 +30,9 @@ ORBIT = "orbit.mp4"
 
 
 def predict(subject: Subject, strategy: Strategy, rank: int = 0, processes: int = 1) -> None:
-    """Predict what is still to do of one process's share; a killed run loses at most the scene in hand."""
+    """Predict what is still to do of one process's share; a killed run loses at most the scenes in hand."""
+    if subject.cfg.scenes_at_once < 1:
+        raise ConfigError(f"scenes_at_once={subject.cfg.scenes_at_once} must be at least 1")
     writer = _writer(subject, strategy)
     to_do = set(writer.pending())
     pending = [scene for scene in writer.scenes[rank::processes] if scene in to_do]
@@ -46,20 +48,21 @@ def predict(subject: Subject, strategy: Strategy, rank: int = 0, processes: int 
         console=Console(stderr=True),
     ) as bar:
         task = bar.add_task(strategy.name, total=len(pending), told="")
-        watch = DistillationBar(lambda told: bar.update(task, told=told))
-        for scene in subject.load(pending) if pending else ():
-            scene = scene.to(subject.device)
-            score = _predict_scene(subject, strategy, writer, scene, [watch])
-            bar.update(task, advance=1, told="" if score is None else f"PSNR {score:.2f}")
+        callbacks = [DistillationBar(lambda told: bar.update(task, told=told))]
+        loaded = iter(subject.load(pending)) if pending else iter(())
+        while scenes := [scene.to(subject.device) for scene in islice(loaded, subject.cfg.scenes_at_once)]:
+            watch = Stopwatch(subject.device)
+            with watch.measure(), subject.autocast():
+                predicted = strategy.predict(subject.model, scenes, subject.cfg.seed, callbacks)
+            for scene, views in zip(scenes, predicted, strict=True):
+                score = _write(subject, strategy, writer, scene, views, watch.seconds[0] / len(scenes))
+                bar.update(task, advance=1, told="" if score is None else f"PSNR {score:.2f}")
 
 
-def _predict_scene(
-    subject: Subject, strategy: Strategy, writer: PredictionWriter, scene: ViewBatch, callbacks: Sequence[Callback]
+def _write(
+    subject: Subject, strategy: Strategy, writer: PredictionWriter, scene: ViewBatch, views: Views, seconds: float
 ) -> float | None:
-    """PSNR, where there is a truth."""
-    watch = Stopwatch(subject.device)
-    with watch.measure(), subject.autocast():
-        views = strategy.predict(subject.model, scene, subject.cfg.seed, callbacks)
+    """Save one scene's views; their PSNR, where there is a truth."""
     writer.write(
         scene.scene_ids[0],
         scene.target_views[0],
@@ -68,7 +71,7 @@ def _predict_scene(
         depth=views.depth,
         opacity=views.opacity,
         cost={
-            "seconds": watch.seconds[0],
+            "seconds": seconds,
             "peak_mem_bytes": _peak_memory(subject.device),
             "denoiser_calls": views.denoiser_calls,
             "field_queries": views.field_queries,
@@ -102,7 +105,8 @@ def orbit_frames(subject: Subject, strategy: Strategy, scene: ViewBatch, saved: 
     frames = scene.source_pixels[:, None].expand(-1, cameras.shape[1], -1, -1, -1)
     view = replace(scene, target_cameras=cameras, target_pixels=frames, target_depth=None, target_mask=None)
     with subject.autocast():
-        return strategy.predict(subject.model, view, subject.cfg.seed).images.cpu()
+        (views,) = strategy.predict(subject.model, [view], subject.cfg.seed)
+    return views.images.cpu()
 
 
 def saved_field(subject: Subject, strategy: Strategy, scene_id: str) -> SavedField | None:

@@ -11,6 +11,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from nerfdiff.checkpoint import LoadedModel, load_model
+from nerfdiff.compilation import compile_unets
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.errors import ConfigError
@@ -155,6 +156,11 @@ def _subject(
     }
     folder = Path(cfg.paths.output_dir) / f"{cfg.strategy.name}-{sha256_values(identity)[:8]}"
     model = loaded.model.to(device).requires_grad_(False)
-    if cfg.chunk is not None:
-        model.renderer = replace(model.renderer, chunk=cfg.chunk)
+    model.renderer = replace(model.renderer, backend=cfg.backend, chunk=cfg.chunk or model.renderer.chunk)
+    channels_last = cfg.channels_last
+    if channels_last is None:
+        channels_last = device.type == "cpu" or cfg.compile != "none"
+    if channels_last:
+        model.to(memory_format=torch.channels_last)
+    compile_unets(model, cfg.compile, cfg.paths.compiled_dir)
     return Subject(cfg, model, load, scene_ids, device, precision, identity, folder, data)

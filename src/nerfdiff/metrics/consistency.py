@@ -5,11 +5,11 @@ import math
 from dataclasses import dataclass, field
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Int64, UInt8
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras
+from nerfdiff.distill.inner_steps import InnerSteps
 from nerfdiff.distill.ray_batches import RayBatches
 from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.field.decoder import Decoder
@@ -110,14 +110,10 @@ class Consistency:
         bounds = [torch.tensor([value], device=device, dtype=torch.float32) for value in (near, far)]
         fresh = self._fresh(source, *bounds, (self.seed, "consistency", scene_id))
         renderer = Renderer(self.uniform_samples, self.importance_samples, self.background, self.chunk)
-        batches = RayBatches(
-            cameras[fitted][None],
-            *bounds,
-            dequantise(pixels[fitted]),
-            generator(device, self.seed, "consistency", scene_id, "rays"),
-        )
+        batches = RayBatches(cameras[fitted][None], *bounds)
+        batches.paint(dequantise(pixels[fitted])[None])
         with torch.enable_grad():
-            self._fit(fresh, batches, renderer)
+            self._fit(fresh, renderer, batches, generator(device, self.seed, "consistency", scene_id, "rays"))
         with torch.no_grad():
             rendered = fresh.render(renderer, cameras[held_out][None]).rgb[0].movedim(-1, 1)
         return psnr(rendered.clamp(0, 1), dequantise(pixels[held_out])).mean().item()
@@ -136,13 +132,10 @@ class Consistency:
         frustum = Triplane((self.initial_std * planes).to(near.device), source, near, far)
         return RefinedField(frustum, decoder.to(near.device))
 
-    def _fit(self, fresh: RefinedField, batches: RayBatches, renderer: Renderer) -> None:
-        optimizer = torch.optim.Adam(fresh.parameters(), lr=self.lr)
+    def _fit(self, fresh: RefinedField, renderer: Renderer, batches: RayBatches, rays: torch.Generator) -> None:
+        optimizer = torch.optim.Adam(fresh.parameters(), lr=self.lr, fused=True)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(self.steps, 1))
+        inner = InnerSteps(fresh, renderer, batches, optimizer, self.rays, [rays], record=False)
         for _ in range(self.steps):
-            rays, colours, jitter = batches.draw(self.rays, renderer.samples_per_ray)
-            loss = F.mse_loss(renderer.render(fresh.field(), rays, jitter).rgb, colours)
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
+            inner.run(1)
             schedule.step()

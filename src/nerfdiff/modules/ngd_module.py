@@ -1,18 +1,20 @@
-"""Test-time fine-tuning of one scene's field with the frozen CDM (paper, "Fine-tuning Phase")."""
+"""Test-time fine-tuning of scenes' fields with the frozen CDM (paper, "Fine-tuning Phase")."""
 
 import math
+from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
+from jaxtyping import Float
 from lightning import LightningModule
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras
+from nerfdiff.distill.inner_steps import InnerSteps
 from nerfdiff.distill.ray_batches import RayBatches
-from nerfdiff.distill.refined_field import RefinedField
+from nerfdiff.distill.refined_field import RefinedField, choose
 from nerfdiff.distill.teacher import Teacher
 from nerfdiff.distill.trace import Step
-from nerfdiff.distill.virtual_views import Images, VirtualViews
+from nerfdiff.distill.virtual_views import VirtualViews
 from nerfdiff.errors import ConfigError
 from nerfdiff.randomness import generator
 
@@ -23,144 +25,195 @@ DECAYS = {
 }
 """Factors of the learning rates, by the share of the teacher's steps that are done."""
 
+SceneImages = Float[Tensor, "scenes views 3 height width"]
+
 
 class NGDModule(LightningModule):
-    """At every step: ask the teacher for images of all views, then fit the field to them.
+    """At every step: ask the teachers for images of all views, then fit the fields to them.
 
-    The CDM and the encoder are no part of this module: what is saved, moved and counted is the field.
+    The CDM and the encoder are no part of this module: what is saved, moved and counted is the fields. Scenes share
+    nothing but the device's time: each has its own views, teacher, noise, parameters, loss and end.
 
     Args:
-        field: the single-image NeRF to start from.
-        views: the virtual views.
-        teacher: of the target images; `ngd`, `direct`, `sds` and `stochastic` differ in nothing else.
+        field: the single-image NeRFs to start from, of one or several scenes.
+        views: the virtual views of each scene, as many for all.
+        teachers: of each scene's target images; `ngd`, `direct`, `sds` and `stochastic` differ in nothing else.
         inner_steps: N, Adam steps after each of the teacher's.
-        rays: B, per inner step.
+        rays: B, per inner step and scene.
         lr_planes, lr_decoder: learning rates of W and θ.
         lr_decay: of both, over the teacher's steps: `none`, `linear` or `cosine`.
         fit_source: whether the input image, the one view that is known, is fitted beside the virtual views.
-        source_tolerance: dB by which the input view may get worse before the scene falls back to its first field.
-        seed: of the rays.
+        target_tolerance, source_tolerance: dB by which the last targets and the input view may be explained worse
+            before a scene falls back to its first field.
+        cuda_graphs: record an inner step once and replay it, on a GPU.
+        seeds: of each scene's rays.
 
     Raises:
-        ConfigError: another `lr_decay`, no rays, or negative steps.
+        ConfigError: another `lr_decay`, no rays, negative steps, or scenes with different numbers of views.
     """
 
     def __init__(
         self,
         field: RefinedField,
-        views: VirtualViews,
-        teacher: Teacher,
+        views: Sequence[VirtualViews],
+        teachers: Sequence[Teacher],
         inner_steps: int,
         rays: int,
         lr_planes: float,
         lr_decoder: float,
         lr_decay: str,
         fit_source: bool,
+        target_tolerance: float,
         source_tolerance: float,
-        seed: tuple[int | str, ...],
+        cuda_graphs: bool,
+        seeds: Sequence[tuple[int | str, ...]],
     ):
         super().__init__()
         self.automatic_optimization = False
         self.field = field
-        self.views, self.teacher = views, teacher
+        self.views, self.teachers = views, teachers
         self.inner_steps, self.rays = inner_steps, rays
         if rays < 1 or inner_steps < 0:
             raise ConfigError(f"rays={rays} must be at least 1 and inner_steps={inner_steps} at least 0")
         if lr_decay not in DECAYS:
             raise ConfigError(f"strategy.lr_decay={lr_decay!r}: choose {', '.join(DECAYS)}")
+        if len({len(v) for v in views}) > 1:
+            raise ConfigError(
+                f"scenes with {sorted({len(v) for v in views})} virtual views cannot be distilled together: "
+                "set scenes_at_once=1"
+            )
         self.lr_planes, self.lr_decoder, self.lr_decay = lr_planes, lr_decoder, lr_decay
-        self.fit_source, self.source_tolerance = fit_source, source_tolerance
-        self.seed = seed
-        self.trace: list[Step] = []
-        self.status = "ok"
+        self.fit_source = fit_source
+        self.tolerances = target_tolerance, source_tolerance
+        self.cuda_graphs = cuda_graphs
+        self.seeds = seeds
+        self.statuses = ["ok"] * len(field)
+        self.cameras = Cameras.join([v.cameras for v in views])
+        self._source = torch.cat([v.encoding.source for v in views])
+        self._records: list[tuple[float | None, float | None, Tensor | None, Tensor | None, Tensor | None]] = []
+
+    @property
+    def steps(self) -> int:
+        """How many times the teachers are asked."""
+        return self.teachers[0].steps
 
     def train_dataloader(self) -> range:
-        """The teacher's steps."""
-        return range(self.teacher.steps)
+        """The teachers' steps."""
+        return range(self.steps)
 
     def configure_optimizers(self) -> tuple[list, list]:
-        optimizer = torch.optim.Adam(
-            [
-                {"params": [self.field.planes], "lr": self.lr_planes},
-                {"params": self.field.decoder.parameters(), "lr": self.lr_decoder},
-            ]
-        )
-        decay, steps = DECAYS[self.lr_decay], self.teacher.steps
+        # The rates are tensors so that a recorded step reads what they are when it is replayed.
+        rates = torch.tensor([self.lr_planes, self.lr_decoder], device=self.device)
+        groups = [
+            {"params": [self.field.planes], "lr": rates[0]},
+            {"params": list(self.field.decoder.parameters()), "lr": rates[1]},
+        ]
+        optimizer = torch.optim.Adam(groups, fused=True, capturable=self.device.type == "cuda")
+        decay, steps = DECAYS[self.lr_decay], self.steps
         return [optimizer], [torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: decay(step / steps))]
 
     def on_train_start(self) -> None:
         self._start = self.field.snapshot()
         self._good = self._start
-        self._generator = generator(self.device, *self.seed, "rays")
-
-    def training_step(self, step: int, batch_idx: int) -> None:
-        rendered = self._render(self.views.cameras) if self.teacher.follows_field else None
-        targets = self.teacher.targets(step, rendered)
-        losses = self._fit(targets)
-        if self.inner_steps > 0:
-            self.lr_schedulers().step()
-        first, last = (float(losses[0]), float(losses[-1])) if len(losses) else (None, None)
-        distance = first if rendered is None else float(F.mse_loss(rendered, targets))
-        agreement = None if distance is None else -10 * math.log10(distance + 1e-6)
-        self.trace.append(Step(self.teacher.t, self.teacher.weight, first, last, agreement))
-        if bool(torch.isfinite(losses).all()) and self.field.is_finite():
-            self._good, self._last_targets = self.field.snapshot(), targets
-        else:
-            self._fall_back("non-finite", self._good)
-
-    def on_train_end(self) -> None:
-        """Back to the field it began as, if it has been harmed.
-
-        It has if it explains the last targets worse than the one it began as, or, as those may have followed it
-        astray, the input view much worse.
-        """
-        if self.status != "ok" or self.inner_steps == 0:
-            return
-        refined = self._distances()
-        after = self.field.snapshot()
-        self.field.load_state_dict(self._start)
-        began = self._distances()
-        tolerated = 10 ** (self.source_tolerance / 10)
-        if refined[0] <= began[0] and refined[1] <= tolerated * began[1] + 1e-6:
-            self.field.load_state_dict(after)
-        else:
-            self._fall_back("diverged", self._start)
-
-    def _fit(self, targets: Images) -> Tensor:
-        """N inner steps; their losses."""
-        optimizer, renderer = self.optimizers(), self.views.model.renderer
-        cameras = self.views.cameras
+        self._finite = torch.ones(len(self.field), dtype=torch.bool, device=self.device)
+        cameras = self.cameras
         if self.fit_source:
-            cameras = Cameras.join([cameras[0], self.field.cameras])[None]
-            targets = torch.cat([targets, self.views.encoding.source])
-        batches = RayBatches(cameras, self.field.near, self.field.far, targets, self._generator)
-        losses = []
-        for _ in range(self.inner_steps):
-            rays, colours, jitter = batches.draw(self.rays, renderer.samples_per_ray)
-            loss = F.mse_loss(renderer.render(self.field.field(), rays, jitter).rgb, colours)
-            optimizer.zero_grad()
-            self.manual_backward(loss)
-            optimizer.step()
-            losses.append(loss.detach())
-        self.views.field_queries += renderer.samples_per_ray * self.inner_steps * self.rays
-        return torch.stack(losses) if losses else targets.new_zeros(0)
-
-    @torch.no_grad()
-    def _render(self, cameras: Cameras) -> Images:
-        renderer = self.views.model.renderer
-        images = self.field.render(renderer, cameras).rgb[0].movedim(-1, 1)
-        self.views.field_queries += renderer.samples_per_ray * images[:, 0].numel()
-        return images
-
-    def _distances(self) -> tuple[float, float]:
-        """Mean squared errors of the last targets and of the input view."""
-        source = self._render(self.field.cameras[None])
-        return (
-            float(F.mse_loss(self._render(self.views.cameras), self._last_targets)),
-            float(F.mse_loss(source, self.views.encoding.source)),
+            both = zip(cameras, self.field.cameras, strict=True)
+            cameras = Cameras.stack([Cameras.join([views, source[None]]) for views, source in both])
+        self._batches = RayBatches(cameras, self.field.near, self.field.far)
+        self._inner = InnerSteps(
+            self.field,
+            self.views[0].model.renderer,
+            self._batches,
+            self.optimizers().optimizer,
+            self.rays,
+            [generator(self.device, *seed, "rays") for seed in self.seeds],
+            self.cuda_graphs,
         )
 
-    def _fall_back(self, status: str, state: dict[str, Tensor]) -> None:
-        self.field.load_state_dict(state)
-        self.status = status
-        self.trainer.should_stop = True
+    def training_step(self, step: int, batch_idx: int) -> None:
+        rendered = self._render(self.cameras) if self.teachers[0].follows_field else None
+        per_scene = [None] * len(self.teachers) if rendered is None else rendered
+        targets = torch.stack([t.targets(step, images) for t, images in zip(self.teachers, per_scene, strict=True)])
+        losses = self._fit(targets)
+        first, last = (losses[0], losses[-1]) if len(losses) else (None, None)
+        distance = first if rendered is None else _mse(rendered, targets)
+        self._records.append((self.teachers[0].t, self.teachers[0].weight, first, last, distance))
+        self._keep_what_is_good(losses, targets)
+
+    def on_train_end(self) -> None:
+        """Back to the last good field, or if it has been harmed to the one it began as.
+
+        It has been if it explains the last targets worse than the one it began as (not by little: they may want what
+        a blurred field gives up), or, as they may have followed it astray, the input view much worse.
+        """
+        self.field.restore(self._good, ~self._finite)
+        harmed = torch.zeros_like(self._finite)
+        if self.inner_steps > 0:
+            refined, after = self._distances(), self.field.snapshot()
+            self.field.restore(self._start, ~harmed)
+            began = self._distances()
+            of_targets, of_source = (
+                10 ** (dB / 10) * was + 1e-6 for dB, was in zip(self.tolerances, began, strict=True)
+            )
+            harmed = ~((refined[0] <= of_targets) & (refined[1] <= of_source)) & self._finite
+            self.field.restore(after, ~harmed)
+        for scene, (finite, worse) in enumerate(zip(self._finite.tolist(), harmed.tolist(), strict=True)):
+            self.statuses[scene] = "non-finite" if not finite else "diverged" if worse else "ok"
+
+    def trace(self, scene: int) -> list[Step]:
+        """What happened, step by step. Waits for the device."""
+
+        def number(values: Tensor | None) -> float | None:
+            return None if values is None else float(values[scene])
+
+        return [
+            Step(t, weight, number(first), number(last), None if distance is None else _psnr(number(distance)))
+            for t, weight, first, last, distance in self._records
+        ]
+
+    def progress(self) -> tuple[float | None, float | None]:
+        """t of the last step and the mean agreement of renderings and targets, in dB. Waits for the device."""
+        t, *_, distance = self._records[-1]
+        return t, None if distance is None else _psnr(float(distance.mean()))
+
+    def _fit(self, targets: SceneImages) -> Float[Tensor, "steps scenes"]:
+        """N inner steps; their losses."""
+        if self.inner_steps == 0:
+            return targets.new_zeros(0, len(targets))
+        self._batches.paint(torch.cat([targets, self._source[:, None]], 1) if self.fit_source else targets)
+        losses = self._inner.run(self.inner_steps)
+        self.lr_schedulers().step()
+        for views in self.views:
+            views.field_queries += self.inner_steps * self._inner.queries
+        return losses
+
+    def _keep_what_is_good(self, losses: Float[Tensor, "steps scenes"], targets: SceneImages) -> None:
+        """Note which scenes are well, on the device: nobody waits to hear it. One that is not stays lost."""
+        self._finite &= torch.isfinite(losses).all(0) & self.field.finite()
+        if self._good is self._start:
+            self._last_targets = targets
+        keep = self._finite.reshape(-1, 1, 1, 1, 1)
+        self._last_targets = torch.where(keep, targets, self._last_targets)
+        self._good = choose(self._finite, self.field.snapshot(), self._good)
+
+    @torch.no_grad()
+    def _render(self, cameras: Cameras) -> SceneImages:
+        renderer = self.views[0].model.renderer
+        images = self.field.render(renderer, cameras).rgb.movedim(-1, 2)
+        for views in self.views:
+            views.field_queries += renderer.samples_per_ray * images[0, :, 0].numel()
+        return images
+
+    def _distances(self) -> tuple[Float[Tensor, "scenes"], Float[Tensor, "scenes"]]:
+        """Mean squared errors of the last targets and of the input view."""
+        source = self._render(self.field.cameras[:, None])
+        return _mse(self._render(self.cameras), self._last_targets), _mse(source[:, 0], self._source)
+
+
+def _mse(images: Float[Tensor, "scenes *rest"], others: Float[Tensor, "scenes *rest"]) -> Float[Tensor, "scenes"]:
+    return (images - others).square().flatten(1).mean(1)
+
+
+def _psnr(mse: float) -> float:
+    return -10 * math.log10(mse + 1e-6)

@@ -1,0 +1,104 @@
+"""The inner steps of distillation: a field fitted to images on random rays (Algorithm 1's last lines)."""
+
+import logging
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfdiff.distill.ray_batches import RayBatches
+from nerfdiff.distill.refined_field import RefinedField
+from nerfdiff.render.renderer import Renderer
+
+log = logging.getLogger(__name__)
+
+
+class InnerSteps:
+    """Steps of an optimizer on rays drawn over all views of each scene.
+
+    All that is random is drawn before the first step, and nothing in between waits for the device: on a GPU a step
+    is recorded once as a CUDA graph and replayed, since launching its kernels takes longer than they do.
+
+    Args:
+        field: of one or several scenes; each fits its own part of it, whatever the others do.
+        renderer: that shows it.
+        batches: rays and colours.
+        optimizer: of the field's parameters; `capturable` where steps are to be recorded.
+        rays: B, per step and scene.
+        generators: one per scene, so that a scene's rays do not depend on its company.
+        record: replay a CUDA graph, on a GPU.
+    """
+
+    def __init__(
+        self,
+        field: RefinedField,
+        renderer: Renderer,
+        batches: RayBatches,
+        optimizer: torch.optim.Optimizer,
+        rays: int,
+        generators: Sequence[torch.Generator],
+        record: bool,
+    ):
+        self.field, self.renderer, self.batches, self.optimizer = field, renderer, batches, optimizer
+        self.rays, self.generators = rays, generators
+        self._record = record and field.planes.device.type == "cuda"
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._steps: int | None = None
+
+    @property
+    def queries(self) -> int:
+        """Points of one scene at which a step evaluates its field."""
+        return self.rays * self.renderer.samples_per_ray
+
+    def run(self, steps: int) -> Float[Tensor, "{steps} scenes"]:
+        """Take `steps` steps; the mean squared error of each, before it."""
+        self._draw(steps)
+        eager = steps if not self._record else 0 if self._graph is not None else min(steps, 3)
+        for _ in range(eager):  # before recording, as its warm-up
+            self._step()
+        if eager < steps and self._graph is None:
+            self._try_to_record()
+        for _ in range(eager, steps):
+            self._step() if self._graph is None else self._graph.replay()
+        return self._losses.clone()
+
+    def _draw(self, steps: int) -> None:
+        """Which rays, and where on them: into the same memory every time, which a recorded step reads."""
+        scenes, per_scene = self.batches.shape
+        device = self.field.planes.device
+        if steps != self._steps:
+            self._steps, self._graph = steps, None
+            self._picked = torch.empty(scenes, steps, self.rays, dtype=torch.long, device=device)
+            self._jitter = torch.empty(scenes, steps, self.rays, self.renderer.samples_per_ray, device=device)
+            self._losses = torch.empty(steps, scenes, device=device)
+            self._number = torch.zeros(1, dtype=torch.long, device=device)
+        for scene, source in enumerate(self.generators):
+            self._picked[scene].random_(per_scene, generator=source)
+            self._jitter[scene].uniform_(generator=source)
+        self._number.zero_()
+
+    def _step(self) -> None:
+        """The step whose number is on the device."""
+        picked, jitter = (drawn.index_select(1, self._number)[:, 0] for drawn in (self._picked, self._jitter))
+        rays, colours = self.batches.at(picked)
+        rgb = self.renderer.render(self.field.field(), rays, jitter).rgb
+        losses = F.mse_loss(rgb, colours, reduction="none").mean((1, 2))
+        self.optimizer.zero_grad()
+        losses.sum().backward()  # each scene's gradient is that of its own loss
+        self.optimizer.step()
+        self._losses.index_copy_(0, self._number, losses.detach()[None])
+        self._number += 1
+
+    def _try_to_record(self) -> None:
+        graph = torch.cuda.CUDAGraph()
+        try:
+            self.optimizer.zero_grad()
+            with torch.cuda.graph(graph):
+                self._step()
+        except RuntimeError as error:
+            log.warning("inner steps are not replayed from a CUDA graph: %s", str(error).splitlines()[0])
+            self._record = False
+            return
+        self._graph = graph

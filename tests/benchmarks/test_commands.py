@@ -1,0 +1,132 @@
+"""Every benchmark as a command, at a size of seconds: what it writes, never how long it took."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+import all as all_of_them
+import inner_step
+import ngd_object
+import render
+import training_step
+import unet
+
+TOY = ["--size", "16", "--seconds", "0.001", "--device", "cpu", "--precision", "32-true"]
+SMALL = ["model.unet.channel_mult=[1,2]", "model.render.uniform_samples=4", "model.render.importance_samples=4"]
+
+
+def run(command, out, *words) -> dict:
+    path = Path(command.main([*SMALL, *TOY, "--out", str(out), *words]))
+    assert path.parent == out
+    content = json.loads(path.read_text())
+    assert content["benchmark"] == command.__name__ and content["model"] == "tiny" and content["image_size"] == [16, 16]
+    assert content["limits"]["copy"] > 0 and content["limits"]["matrix"] > 0
+    for row in content["rows"]:
+        assert (row["seconds"] is None) == (row["reason"] is not None)
+        if row["seconds"]:
+            assert row["seconds"]["median"] > 0 and row["work"]["flops"] > 0 and row["share_of_matrix_rate"] > 0
+    return content
+
+
+def ran(content) -> dict[str, dict]:
+    return {row["name"]: row for row in content["rows"] if row["seconds"]}
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="checks what a machine without a GPU says")
+def test_render_times_each_backend_forward_and_backward(tmp_path):
+    content = run(render, tmp_path, "--rays", "32")
+    assert ran(content).keys() == {"torch, forward", "torch, forward and backward"}
+    assert {row["reason"] for row in content["rows"]} == {None, "needs a CUDA GPU"}
+    assert content["settings"] == {"rays": 32, "samples": 8, "plane": 16, "scenes": 1}
+    forward, both = ran(content).values()
+    assert both["work"]["flops"] == 3 * forward["work"]["flops"] and forward["ratio"] == 1
+
+
+@pytest.mark.parametrize("sweep", render.SWEEPS)
+def test_render_makes_scaling_curves(sweep, tmp_path):
+    content = run(render, tmp_path, "--rays", "32", "--sweep", sweep, "--values", "4", "8")
+    assert content["sweep"] == sweep and [path.suffix for path in sorted(tmp_path.iterdir())] == [".json", ".png"]
+    rows = [row for row in content["rows"] if row["name"] == "torch, forward"]
+    assert [row["setting"][sweep] for row in rows] == [4, 8]
+    flops = [row["work"]["flops"] for row in rows]
+    assert flops[1] == (flops[0] if sweep == "plane" else 2 * flops[0])
+
+
+def test_inner_step_times_a_step_of_several_scenes(tmp_path):
+    words = ["--rays", "16", "--views", "2", "--steps", "2", "--sweep", "scenes", "--values", "1", "2"]
+    content = run(inner_step, tmp_path, *words)
+    one, two = (row for row in content["rows"] if row["name"] == "torch")
+    assert two["work"]["bytes"] == 2 * one["work"]["bytes"]
+    assert two["more"]["steps/s, all scenes"] == pytest.approx(2 / two["seconds"]["median"])
+
+
+def test_unet_times_encoder_and_denoiser(tmp_path):
+    content = run(unet, tmp_path, "--views", "2")
+    assert {name.split(",")[0] for name in ran(content)} == {"encoder", "CDM"}
+    assert ran(content)["CDM, eager"]["setting"] == {"views": 2}
+
+
+def test_ngd_object_times_an_object_and_its_parts(tmp_path):
+    budget = ["--sweep", "views", "--values", "2", "--steps", "1"]
+    content = run(ngd_object, tmp_path, *budget, "--extrapolate")
+    rows, steps = ran(content), content["settings"]["steps"]
+    whole = rows["object, reference"]
+    assert whole["more"]["extrapolated from steps"] == 1 and f"1 of {steps}" in content["notes"][0]
+    assert whole["more"]["objects/min"] == pytest.approx(60 / whole["seconds"]["median"])
+    parts = {name.rpartition(", ")[0]: row for name, row in rows.items() if name.endswith("reference")}
+    once = parts["encode"]["work"]["flops"] + parts["conditions"]["work"]["flops"]
+    each = sum(parts[part]["work"]["flops"] for part in ("denoise K views", "render K views", "N inner steps"))
+    assert whole["work"]["flops"] == pytest.approx(once + steps * each)
+
+
+def test_what_is_timed_in_part_is_said(tmp_path):
+    words = ["--sweep", "scenes", "--values", "2", "--steps", "1", "--whole", "--strategy", "sds"]
+    content = run(ngd_object, tmp_path, *words)
+    assert content["notes"][0].startswith("PARTIAL: objects are of 1 diffusion steps")
+    row = ran(content)["2 objects, reference"]
+    assert row["more"]["s/object"] == pytest.approx(row["seconds"]["median"] / 2)
+    assert "extrapolated from steps" not in row["more"]
+
+
+def test_extrapolating_asks_for_what_it_needs():
+    for words in (["--extrapolate"], ["--extrapolate", "--steps", "2", "--whole"]):
+        with pytest.raises(SystemExit):
+            ngd_object.main(words)
+
+
+def test_extrapolation_repeats_the_steps_alone():
+    assert ngd_object._extrapolated(7.0, 1.0, steps=2, all_steps=16) == 1 + 16 * 3
+
+
+def test_training_step_times_a_step_and_finds_the_largest_batch(tmp_path):
+    content = run(training_step, tmp_path, "--batch", "2", "--memory", "0.5")
+    row = ran(content)["torch, eager"]
+    assert row["more"]["images/s"] == pytest.approx(2 / row["seconds"]["median"])
+    assert content["settings"]["largest batch in 0.5 GiB, computed in 32-true"] > 0
+
+
+@pytest.mark.parametrize("most", [0, 1, 5, 8, 100])
+def test_the_largest_that_fits(most):
+    assert training_step.largest(lambda number: number <= most) == most
+
+
+def test_all_of_them_are_planned_within_the_time(tmp_path):
+    arguments = all_of_them._arguments(["--minutes", "5", "--model", "base", "--sweeps", "--out", str(tmp_path)])
+    jobs = all_of_them.plan(arguments)
+    assert [name for name, _, _ in jobs[:5]] == list(all_of_them.SHARES)
+    for name, _, options in jobs:
+        module = {"render": render, "unet": unet, "inner_step": inner_step, "ngd_object": ngd_object}.get(
+            name, training_step
+        )
+        parsed = module._arguments(options)
+        assert parsed.out == tmp_path and parsed.model == "base"
+
+
+def test_one_that_fails_or_takes_too_long_does_not_stop_the_others(monkeypatch, capfd, tmp_path):
+    monkeypatch.setattr(all_of_them, "SHARES", {"nothing_here": 1.0})
+    assert all_of_them.main(["--minutes", "1", "--out", str(tmp_path)]) == 1
+    monkeypatch.setattr(all_of_them, "SHARES", {"render": 1.0, "nothing_here": 1.0})
+    assert all_of_them.main(["--minutes", "0.0001", "--out", str(tmp_path)]) == 2
+    assert "stopped after" in capfd.readouterr().err

@@ -1,0 +1,117 @@
+"""Inner steps against a plain loop that knows nothing of batches, fused optimizers or recorded steps."""
+
+import copy
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from model_fixtures import input_cameras, look_at
+from nerfdiff.cameras import Cameras, Rays
+from nerfdiff.distill.inner_steps import InnerSteps
+from nerfdiff.distill.ray_batches import RayBatches
+from nerfdiff.distill.refined_field import RefinedField
+from nerfdiff.field.decoder import Decoder
+from nerfdiff.field.triplane import Triplane
+from nerfdiff.render.renderer import Renderer
+
+RENDERER = Renderer(4, 3, 1.0, 4096)
+SIZE, RAYS, STEPS = 16, 32, 5
+
+
+def fields(scenes: int, device="cpu") -> RefinedField:
+    torch.manual_seed(1)
+    near, far = torch.full((scenes,), 0.8), torch.linspace(1.7, 1.9, scenes)
+    triplane = Triplane(torch.randn(scenes, 3, 4, SIZE, SIZE), input_cameras(scenes), near, far)
+    return RefinedField(triplane, Decoder(4, 8, 0.0, 5.0)).to(device)
+
+
+def views(scenes: int, count: int = 2) -> Cameras:
+    places = torch.stack([look_at(place) for place in [(0.9, -0.4, 0.7), (-0.8, 0.3, 1.0)][:count]])
+    K = input_cameras(1).K[0]
+    return Cameras(places.expand(scenes, count, 4, 4), K.expand(scenes, count, 3, 3), SIZE, SIZE)
+
+
+def inner_steps(field: RefinedField, images: torch.Tensor, rays: int = RAYS, record: bool = False) -> InnerSteps:
+    device = field.planes.device
+    batches = RayBatches(views(len(field)).to(device), field.near, field.far)
+    batches.paint(images)
+    rates = torch.tensor([1e-2, 1e-3], device=device)
+    optimizer = torch.optim.Adam(
+        [{"params": [field.planes], "lr": rates[0]}, {"params": list(field.decoder.parameters()), "lr": rates[1]}],
+        fused=True,
+        capturable=device.type == "cuda",
+    )
+    generators = [torch.Generator(device).manual_seed(scene) for scene in range(len(field))]
+    return InnerSteps(field, RENDERER, batches, optimizer, rays, generators, record)
+
+
+def test_steps_are_those_of_a_plain_loop_over_each_scene_by_itself():
+    field, images = fields(2), torch.rand(2, 2, 3, SIZE, SIZE)
+    references = [copy.deepcopy(field.alone(scene)) for scene in range(2)]
+    losses = inner_steps(field, images).run(STEPS)
+    for scene, reference in enumerate(references):
+        draws = torch.Generator().manual_seed(scene)
+        picked = torch.empty(STEPS, RAYS, dtype=torch.long).random_(2 * SIZE**2, generator=draws)
+        jitter = torch.empty(STEPS, RAYS, RENDERER.samples_per_ray).uniform_(generator=draws)
+        optimizer = torch.optim.Adam(
+            [{"params": [reference.planes], "lr": 1e-2}, {"params": reference.decoder.parameters(), "lr": 1e-3}],
+            foreach=False,
+        )
+        rays = views(1)[0].rays(reference.near, reference.far)
+        shape = rays.directions.shape[:-1]
+        colours = images[scene].movedim(1, -1)
+        for step in range(STEPS):
+            view, row, column = torch.unravel_index(picked[step], shape)
+            chosen = Rays(
+                rays.origins.expand(*shape, 3)[view, row, column][None],
+                rays.directions[view, row, column][None],
+                rays.near.expand(shape)[view, row, column][None],
+                rays.far.expand(shape)[view, row, column][None],
+            )
+            rgb = RENDERER.render(reference.field(), chosen, jitter[step][None]).rgb[0]
+            loss = F.mse_loss(rgb, colours[view, row, column])
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            assert losses[step, scene].item() == pytest.approx(loss.item(), rel=1e-4)
+        torch.testing.assert_close(field.planes[scene], reference.planes[0], atol=2e-5, rtol=1e-4)
+        for name, value in reference.decoder.named_parameters():
+            fitted = dict(field.decoder.named_parameters())[name][scene]
+            torch.testing.assert_close(fitted, value, atol=2e-5, rtol=1e-4)
+
+
+def test_painting_changes_what_is_fitted_and_drawing_goes_on():
+    field, images = fields(1), torch.rand(1, 2, 3, SIZE, SIZE)
+    inner = inner_steps(field, images)
+    inner.run(2)
+    first = inner._picked.clone()
+    inner.batches.paint(torch.zeros_like(images))
+    inner.run(2)
+    assert not torch.equal(inner._picked, first)
+    assert inner.batches.at(inner._picked[:, 0])[1].eq(0).all()
+
+
+def test_no_step_is_no_loss_and_no_change():
+    field = fields(1)
+    before = field.planes.detach().clone()
+    assert inner_steps(field, torch.rand(1, 2, 3, SIZE, SIZE)).run(0).shape == (0, 1)
+    assert torch.equal(field.planes, before)
+
+
+def test_one_ray_is_enough():
+    losses = inner_steps(fields(1), torch.rand(1, 2, 3, SIZE, SIZE), rays=1).run(2)
+    assert losses.shape == (2, 1) and bool(torch.isfinite(losses).all())
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
+def test_a_recorded_step_does_what_the_step_does():
+    images = torch.rand(2, 2, 3, SIZE, SIZE, device="cuda")
+    field, recorded = fields(2, "cuda"), fields(2, "cuda")
+    plain, replayed = inner_steps(field, images), inner_steps(recorded, images, record=True)
+    for _ in range(2):  # the second time, everything is replayed
+        torch.testing.assert_close(replayed.run(8), plain.run(8), atol=1e-5, rtol=1e-3)
+        replayed.optimizer.param_groups[0]["lr"].mul_(0.5)
+        plain.optimizer.param_groups[0]["lr"].mul_(0.5)
+    assert replayed._graph is not None
+    torch.testing.assert_close(recorded.planes, field.planes, atol=1e-4, rtol=1e-3)

@@ -96,8 +96,7 @@ def test_every_teacher_fits_the_field_and_leaves_the_model_alone(teacher):
     assert not torch.equal(other.field.planes, module.field.planes)
 
 
-@pytest.mark.parametrize("teacher", TEACHERS)
-@pytest.mark.parametrize("fit_source", [False, True])
+@pytest.mark.parametrize(("teacher", "fit_source"), [(name, name.startswith("ngd")) for name in TEACHERS])
 def test_a_scene_does_not_depend_on_its_company(teacher, fit_source):
     net = model(conditioning={"residual_std": 0.2}).requires_grad_(False)
     method = distillation(TEACHERS[teacher], lr_decay="linear", fit_source=fit_source, lr_planes=1e-3, lr_decoder=1e-3)

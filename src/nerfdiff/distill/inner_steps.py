@@ -14,6 +14,9 @@ from nerfdiff.render.renderer import Renderer
 
 log = logging.getLogger(__name__)
 
+WARM_UP = 3
+"""Steps before one is recorded: kernels are chosen and Adam's state is made in the first."""
+
 
 class InnerSteps:
     """Steps of an optimizer on rays drawn over all views of each scene.
@@ -55,12 +58,11 @@ class InnerSteps:
     def run(self, steps: int) -> Float[Tensor, "{steps} scenes"]:
         """Take `steps` steps; the mean squared error of each, before it."""
         self._draw(steps)
-        eager = steps if not self._record else 0 if self._graph is not None else min(steps, 3)
-        for _ in range(eager):  # before recording, as its warm-up
-            self._step()
-        if eager < steps and self._graph is None:
+        taken = 0
+        if self._record and self._graph is None and steps > WARM_UP:
+            taken = self._warm_up()
             self._try_to_record()
-        for _ in range(eager, steps):
+        for _ in range(taken, steps):
             self._step() if self._graph is None else self._graph.replay()
         return self._losses.clone()
 
@@ -90,6 +92,16 @@ class InnerSteps:
         self.optimizer.step()
         self._losses.index_copy_(0, self._number, losses.detach()[None])
         self._number += 1
+
+    def _warm_up(self) -> int:
+        """The first steps, on a stream of their own, as CUDA graphs ask; how many."""
+        here, aside = torch.cuda.current_stream(), torch.cuda.Stream()
+        aside.wait_stream(here)
+        with torch.cuda.stream(aside):
+            for _ in range(WARM_UP):
+                self._step()
+        here.wait_stream(aside)
+        return WARM_UP
 
     def _try_to_record(self) -> None:
         graph = torch.cuda.CUDAGraph()

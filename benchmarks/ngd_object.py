@@ -89,6 +89,7 @@ def _measure(arguments, measured: Subject, budget: dict[str, int], setting: dict
         row.work = _work(measured, budget, setting, steps)
         if row.seconds is not None and arguments.extrapolate and steps < budget["steps"]:
             once = sum(parts[f"{part}, {name}"].seconds["median"] for part in ("encode", "conditions"))
+            once *= setting["scenes"]  # parts are of one
             row.seconds = {"n": row.seconds["n"]} | {
                 key: _extrapolated(row.seconds[key], once if key == "median" else 0.0, steps, budget["steps"])
                 for key in ("median", "iqr")

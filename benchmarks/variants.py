@@ -25,10 +25,10 @@ def renderers(model: NerfDiff, renderer: Renderer) -> dict[str, Renderer | Unava
     """
     kernels = replace(renderer, backend="triton")
     reason = _obstacle(model, kernels)
-    return {
-        "torch": replace(renderer, backend="torch"),
-        "triton": kernels if reason is None else Unavailable(reason),
-    }
+    ways = {"torch": replace(renderer, backend="torch"), "triton": kernels if reason is None else Unavailable(reason)}
+    if next(model.parameters()).device.type == "cpu":
+        ways["CPU field"] = replace(renderer, backend="auto")
+    return ways
 
 
 def kinds(compiled: bool) -> tuple[str, ...]:

@@ -37,10 +37,11 @@ def ran(content) -> dict[str, dict]:
 @pytest.mark.skipif(torch.cuda.is_available(), reason="checks what a machine without a GPU says")
 def test_render_times_each_backend_forward_and_backward(tmp_path):
     content = run(render, tmp_path, "--rays", "32")
-    assert ran(content).keys() == {"torch, forward", "torch, forward and backward"}
+    ways = ("torch", "CPU field")
+    assert ran(content).keys() == {f"{way}, {what}" for way in ways for what in ("forward", "forward and backward")}
     assert {row["reason"] for row in content["rows"]} == {None, "needs a CUDA GPU"}
     assert content["settings"] == {"rays": 32, "samples": 8, "plane": 16, "scenes": 1}
-    forward, both = ran(content).values()
+    forward, both = (ran(content)[f"torch, {what}"] for what in ("forward", "forward and backward"))
     assert both["work"]["flops"] == 3 * forward["work"]["flops"] and forward["ratio"] == 1
 
 

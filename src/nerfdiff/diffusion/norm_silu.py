@@ -106,12 +106,13 @@ def _launch(x, weight, bias, scale_shift, groups: int, eps: float, dtype: torch.
     out = torch.empty_like(x, dtype=dtype)
     modulation = x if scale_shift is None else scale_shift.contiguous()
     size = channels // groups
-    sums_kernel[(images, parts)](x, sums, pixels, C=channels, CP=padded, R=rows, STEPS=steps)
-    coefficients_kernel[(images,)](
-        x, sums, weight, bias, modulation, coefficients, pixels, parts, eps,
-        MODULATED=scale_shift is not None, GROUPS=groups, SIZE=size, SP=triton.next_power_of_2(size),
-    )  # fmt: skip
-    apply_kernel[(images, triton.cdiv(pixels, rows))](x, coefficients, out, pixels, C=channels, CP=padded, R=rows)
+    with torch.cuda.device_of(x):
+        sums_kernel[(images, parts)](x, sums, pixels, C=channels, CP=padded, R=rows, STEPS=steps)
+        coefficients_kernel[(images,)](
+            x, sums, weight, bias, modulation, coefficients, pixels, parts, eps,
+            MODULATED=scale_shift is not None, GROUPS=groups, SIZE=size, SP=triton.next_power_of_2(size),
+        )  # fmt: skip
+        apply_kernel[(images, triton.cdiv(pixels, rows))](x, coefficients, out, pixels, C=channels, CP=padded, R=rows)
     return out
 
 

@@ -18,6 +18,8 @@ from nerfdiff.results.files import atomic
 
 FIELD = "field.safetensors"
 FORMAT = 1
+MACHINES = ("backend", "precision")
+"""Settings of the renderer that suit a machine, not a field."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ def save_field(path: str | Path, saved: SavedField) -> None:
         "near": float(field.near),
         "far": float(field.far),
         "decoder": field.decoder.settings,
-        "render": asdict(saved.renderer),
+        "render": {name: value for name, value in asdict(saved.renderer).items() if name not in MACHINES},
     }
     state = {name: value.detach().cpu().contiguous() for name, value in field.state_dict().items()}
     with atomic(Path(path)) as temporary:

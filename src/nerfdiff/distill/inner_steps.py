@@ -34,6 +34,9 @@ class InnerSteps:
         record: replay a CUDA graph, on a GPU.
     """
 
+    recording = True
+    """Whether this process can record: what failed once is not tried again for every scene."""
+
     def __init__(
         self,
         field: RefinedField,
@@ -46,7 +49,7 @@ class InnerSteps:
     ):
         self.field, self.renderer, self.batches, self.optimizer = field, renderer, batches, optimizer
         self.rays, self.generators = rays, generators
-        self._record = record and field.planes.device.type == "cuda"
+        self._record = record and InnerSteps.recording and field.planes.device.type == "cuda"
         self._graph: torch.cuda.CUDAGraph | None = None
         self._steps: int | None = None
 
@@ -107,10 +110,11 @@ class InnerSteps:
         graph = torch.cuda.CUDAGraph()
         try:
             self.optimizer.zero_grad()
-            with torch.cuda.graph(graph):
+            # the inner context would not give the stream back where the end of recording fails
+            with torch.cuda.stream(torch.cuda.current_stream()), torch.cuda.graph(graph):
                 self._step()
         except RuntimeError as error:
             log.warning("inner steps are not replayed from a CUDA graph: %s", str(error).splitlines()[0])
-            self._record = False
+            self._record = InnerSteps.recording = False
             return
         self._graph = graph

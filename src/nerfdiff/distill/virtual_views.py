@@ -34,7 +34,7 @@ class VirtualViews:
     ):
         self.model, self.cameras, self.seed = model, cameras, seed
         self.encoding = encoding = model.settled(encoding)
-        self._parts = torch.arange(cameras.shape[1]).split(views_at_once)
+        self._parts = [slice(i, i + views_at_once) for i in range(0, cameras.shape[1], views_at_once)]
         self._conditions: list[Condition] = []
         for part in self._parts:
             chunk = cameras[:, part]

@@ -89,9 +89,9 @@ def _cost(subject: Subject, strategy: Strategy) -> dict[str, Any]:
     fields |= _model_timings(subject) | {"peak_mem_bytes": max(cost["peak_mem_bytes"] for cost in scenes)}
     fields["params"] = subject.model.parameter_count()["total"]
     if fields["denoiser_calls"]:
-        # The first scene warms up, unless it is the only one.
+        # The first batch of scenes warms up, unless it is the only one.
         seconds = [cost["seconds"] for cost in scenes]
-        fields["distill_s"] = summarise(seconds[1:] or seconds)
+        fields["distill_s"] = summarise(seconds[scenes[0]["together"] :] or seconds)
     fallen = Counter(cost["status"] for cost in scenes if cost["status"] != "ok")
     if fallen:
         fields["error"] = "fell back: " + ", ".join(f"{count} scenes {status}" for status, count in fallen.items())

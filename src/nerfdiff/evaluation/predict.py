@@ -55,14 +55,21 @@ def predict(subject: Subject, strategy: Strategy, rank: int = 0, processes: int 
             with watch.measure(), subject.autocast():
                 predicted = strategy.predict(subject.model, scenes, subject.cfg.seed, callbacks)
             for scene, views in zip(scenes, predicted, strict=True):
-                score = _write(subject, strategy, writer, scene, views, watch.seconds[0] / len(scenes))
+                seconds = watch.seconds[0] / len(scenes)
+                score = _write(subject, strategy, writer, scene, views, seconds, len(scenes))
                 bar.update(task, advance=1, told="" if score is None else f"PSNR {score:.2f}")
 
 
 def _write(
-    subject: Subject, strategy: Strategy, writer: PredictionWriter, scene: ViewBatch, views: Views, seconds: float
+    subject: Subject,
+    strategy: Strategy,
+    writer: PredictionWriter,
+    scene: ViewBatch,
+    views: Views,
+    seconds: float,
+    together: int,
 ) -> float | None:
-    """Save one scene's views; their PSNR, where there is a truth."""
+    """Save one scene's views, made with others in `together * seconds`; their PSNR, where there is a truth."""
     writer.write(
         scene.scene_ids[0],
         scene.target_views[0],
@@ -72,6 +79,7 @@ def _write(
         opacity=views.opacity,
         cost={
             "seconds": seconds,
+            "together": together,
             "peak_mem_bytes": _peak_memory(subject.device),
             "denoiser_calls": views.denoiser_calls,
             "field_queries": views.field_queries,

@@ -68,7 +68,8 @@ class Triplane:
         batch, n, _ = points.shape
         with full_precision(points.device):
             coordinates, valid = self.frustum_coordinates(at_least_single(points))
-            grid = torch.stack([coordinates[..., axes] for axes in _AXES], 1)
+            axes = coordinates.unbind(-1)
+            grid = torch.stack([torch.stack([axes[across], axes[down]], -1) for across, down in _AXES], 1)
             features = F.grid_sample(
                 at_least_single(self.planes).flatten(0, 1),
                 grid.flatten(0, 1)[:, None],

@@ -160,6 +160,7 @@ class NGDModule(LightningModule):
             self.field.restore(after, ~harmed)
         for scene, (finite, worse) in enumerate(zip(self._finite.tolist(), harmed.tolist(), strict=True)):
             self.statuses[scene] = "non-finite" if not finite else "diverged" if worse else "ok"
+        del self._inner, self._batches  # module and Trainer hold each other; what they need most of must not wait
 
     def trace(self, scene: int) -> list[Step]:
         """What happened, step by step. Waits for the device."""

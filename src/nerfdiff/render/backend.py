@@ -36,7 +36,7 @@ def check_choice(backend: str, precision: str) -> None:
     """Raises ConfigError unless both are known."""
     for name, choice, choices in (("backend", backend, BACKENDS), ("precision", precision, PRECISIONS)):
         if choice not in choices:
-            raise ConfigError(f"render.{name}={choice!r}: choose {', '.join(choices)}")
+            raise ConfigError(f"{name}={choice!r}: choose {', '.join(choices)}")
 
 
 @torch.compiler.disable
@@ -163,7 +163,10 @@ def _precision(renderer, device: torch.device) -> str:
 
 
 def _regime(device: torch.device) -> str:
-    """The least that rounds no more than autocast, or a product of fp32 matrices, would."""
+    """In what the reference's products would be computed.
+
+    Planes are read likewise: under bf16 autocast texels are rounded, where the reference rounds their weighted sum.
+    """
     if torch.is_autocast_enabled(device.type):
         # products of tf32 have fp16's mantissa and lack its overflow
         return "bf16" if torch.get_autocast_dtype(device.type) == torch.bfloat16 else "tf32"

@@ -45,7 +45,8 @@ class Renderer:
             with more points are recomputed chunk by chunk in the backward pass, so what is kept, beside the rays
             themselves, is O(chunk) whatever the number of samples.
         backend: `torch` is this reference; `triton` renders triplane fields by fused kernels; `auto` takes these on a
-            GPU. Where kernels cannot run, the reference does, and a log line says why.
+            GPU, and on a CPU the field in the form that it computes fastest. Where kernels cannot run, the reference
+            does, and a log line says why.
         precision: of the kernels' products, whose sums are fp32: `ieee` (slow), `tf32x3` (nearly fp32), `tf32`, `bf16`,
             or `auto` for what the reference's products are computed in.
 
@@ -81,7 +82,7 @@ class Renderer:
         parts = [rays.origins, rays.directions, rays.near, rays.far]
         if jitter is not None:
             parts.append(jitter)
-        if not cpu_field.suits(field, rays):
+        if self.backend != "auto" or not cpu_field.suits(field, rays):
             return Rendering(*self._in_chunks(field, parts, recompute))
         scenes = zip(cpu_field.scene_by_scene(field), *(part.split(1) for part in parts), strict=True)
         outputs = [self._in_chunks(alone, own, recompute) for alone, *own in scenes]

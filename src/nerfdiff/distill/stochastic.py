@@ -62,7 +62,8 @@ class AutoregressiveViews(FixedImages):
                 views.denoiser_calls += 1
                 z = run.step(z, x0, t, t_next, views.noise_of(view)[None] if run.needs_noise else None)
             images.append(0.5 * (x0 + 1))
-            encodings.append(model.encode(images[-1], frustum.cameras, frustum.near, frustum.far))
+            encoded = model.encode(images[-1], frustum.cameras, frustum.near, frustum.far)
+            encodings.append(model.settled(encoded))  # seen by many steps of many views
         super().__init__(torch.cat(images), steps)
 
 

@@ -66,7 +66,7 @@ def plan(arguments: argparse.Namespace) -> list[tuple[str, float, list[str]]]:
         jobs.append((name, share, options))
     if arguments.sweeps:
         for name, sweeps in SWEEPS.items():
-            whole = ["--whole"] if name == "ngd_object" and "--extrapolate" not in objects else []
+            whole = ["--whole"] if name == "ngd_object" else []
             options = shared + own.get(name, []) + whole
             jobs += [(name, SHARES[name], [*options, "--sweep", sweep]) for sweep in sweeps]
     return jobs

@@ -1,4 +1,4 @@
-"""How benchmarks measure and what they leave: interleaved timings, the device's own limits, a table and a file.
+"""How benchmarks measure: interleaved timings, and the device's own limits.
 
 Variants of one piece of work are timed in turn, round after round, so that whatever slows the machine slows them all;
 the first variant is the reference, and ratios are medians over rounds. The device's copy bandwidth and matrix rate are
@@ -6,25 +6,17 @@ measured in the same run.
 """
 
 import argparse
-import json
 import math
 import os
-import re
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from datetime import UTC, datetime
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import torch
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
-from nerfdiff.results.environment import environment
-from nerfdiff.results.files import atomic, write_text
 from nerfdiff.results.timing import Stopwatch, summarise
 
 RESULTS = Path(os.environ.get("OUT") or Path(__file__).parent / "results")
@@ -111,6 +103,15 @@ def parser(description: str, model: str = "tiny", sweeps: Sequence[str] = ()) ->
     return made
 
 
+def settings_of(
+    arguments: argparse.Namespace, usual: Mapping[str, int], sweeps: Mapping[str, Sequence[int]]
+) -> list[dict[str, int]]:
+    """What is measured: the usual setting, or a scaling curve's, in which one value differs."""
+    if arguments.sweep is None:
+        return [dict(usual)]
+    return [dict(usual) | {arguments.sweep: value} for value in arguments.values or sweeps[arguments.sweep]]
+
+
 def interleaved(variants: Mapping[str, Variant], device: torch.device, seconds: float) -> dict[str, Row]:
     """Time variants in turn, after a warm-up, for about `seconds` each; one that fails, but for the first, says why."""
     rows = {name: Row(name, {}) for name in variants}
@@ -176,130 +177,3 @@ def limits(device: torch.device, dtype: torch.dtype, seconds: float) -> Limits:
         matrix=2 * side**3 / multiplied.seconds["median"],
         dtype=str(dtype).removeprefix("torch."),
     )
-
-
-def report(
-    benchmark: str,
-    subject: Any,
-    rows: Sequence[Row],
-    limit: Limits,
-    settings: Mapping[str, Any],
-    out: Path,
-    notes: Sequence[str] = (),
-    sweep: str | None = None,
-) -> Path:
-    """Print the table, write it as JSON (and a sweep as a picture), and return the JSON's path.
-
-    Args:
-        subject: a `subjects.Subject`.
-        settings: what the rows have in common.
-        notes: what a reader must know to read the numbers.
-    """
-    facts = environment(subject.device, subject.precision)
-    hardware = facts["device"] if subject.device.type == "cuda" else facts["cpu"]
-    now = datetime.now(UTC)
-    name = benchmark if sweep is None else f"{benchmark}-{sweep}"
-    path = out / f"{name}-{slug(subject.name)}-{slug(hardware)}-{now:%Y-%m-%d}.json"
-    content = {
-        "benchmark": benchmark,
-        "sweep": sweep,
-        "time": now.isoformat(timespec="seconds"),
-        "model": subject.name,
-        "parameters": subject.model.parameter_count(),
-        "image_size": [subject.size, subject.size],
-        "settings": dict(settings),
-        "hardware": hardware,
-        "environment": facts | {"threads": torch.get_num_threads(), "cores": os.cpu_count()},
-        "limits": asdict(limit),
-        "notes": list(notes),
-        "rows": [asdict(row) | _rates(row, limit) for row in rows],
-    }
-    write_text(path, json.dumps(content, indent=1) + "\n")
-    title = f"{name}: {subject.name}, {subject.size} pixels, {subject.precision}, on {hardware}"
-    _print(title, rows, limit, settings, notes)
-    if sweep is not None:
-        _plot(path.with_suffix(".png"), title, sweep, rows)
-    print(path)
-    return path
-
-
-def slug(text: str) -> str:
-    """For a file name: lower case, and one dash for all that is neither letter nor digit."""
-    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
-
-
-def _rates(row: Row, limit: Limits) -> dict[str, float | None]:
-    """Shares of what the device does at best."""
-    if row.seconds is None or row.work is None:
-        return {"share_of_matrix_rate": None, "share_of_copy_bandwidth": None}
-    seconds = row.seconds["median"]
-    return {
-        "share_of_matrix_rate": row.work.flops / seconds / limit.matrix,
-        "share_of_copy_bandwidth": row.work.bytes / seconds / limit.copy,
-    }
-
-
-def _print(title: str, rows: Sequence[Row], limit: Limits, settings: Mapping[str, Any], notes: Sequence[str]) -> None:
-    keys = dict.fromkeys(key for row in rows for key in row.setting)
-    varying = [key for key in keys if len({row.setting.get(key) for row in rows}) > 1]
-    more = list(dict.fromkeys(key for row in rows for key in row.more))
-    table = Table(box=box.SIMPLE, pad_edge=False)
-    for column in ("", *varying, "median", "IQR", "× ref.", "GFLOP", "of matrix", "MB", "of copy", *more):
-        table.add_column(column, justify="right" if column else "left", no_wrap=True)
-    for row in rows:
-        if row.seconds is None:
-            continue
-        rates = _rates(row, limit)
-        cells = [row.name, *(str(row.setting.get(key, "")) for key in varying)]
-        cells += [duration(row.seconds["median"]), duration(row.seconds["iqr"])]
-        cells.append("" if row.ratio is None else f"{row.ratio:.2f}")
-        cells += ["", "", "", ""] if row.work is None else [
-            f"{row.work.flops / 1e9:,.2f}",
-            f"{100 * rates['share_of_matrix_rate']:.1f} %",
-            f"{row.work.bytes / 1e6:,.1f}",
-            f"{100 * rates['share_of_copy_bandwidth']:.1f} %",
-        ]  # fmt: skip
-        cells += [number(row.more[key]) if key in row.more else "" for key in more]
-        table.add_row(*cells)
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=200)  # a log has room for every column
-    console.print(f"\n{title}", style="bold", highlight=False)
-    console.print(", ".join(f"{key} {value}" for key, value in settings.items()), highlight=False)
-    console.print(table)
-    rates = f"{limit.copy / 1e9:,.1f} GB/s, {limit.dtype} matrices {limit.matrix / 1e12:,.3f} TFLOP/s"
-    reasons = dict.fromkeys(f"{row.name}: not run, {row.reason}" for row in rows if row.reason is not None)
-    for line in (f"the device at best, measured: copy {rates}", *notes, *reasons):
-        console.print(line, highlight=False, markup=False)
-
-
-def duration(seconds: float) -> str:
-    """With the unit that suits it."""
-    unit, scale = ("s", 1.0) if seconds >= 1 else ("ms", 1e-3) if seconds >= 1e-3 else ("µs", 1e-6)
-    return f"{seconds / scale:,.3g} {unit}" if seconds < 1000 else f"{seconds:,.0f} s"
-
-
-def number(value: Any) -> str:
-    """As short as it can be read."""
-    if isinstance(value, float):
-        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-    return str(value)
-
-
-def _plot(path: Path, title: str, sweep: str, rows: Sequence[Row]) -> None:
-    """Seconds over the swept value, one line per variant; dashed is what proportional cost would be."""
-    from matplotlib.figure import Figure  # not pyplot: no global state, and no display
-
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    axes = figure.subplots()
-    for name in dict.fromkeys(row.name for row in rows):
-        points = [(row.setting[sweep], row.seconds) for row in rows if row.name == name and row.seconds]
-        if points:
-            values, seconds = zip(*points, strict=True)
-            (line,) = axes.plot(values, [s["median"] for s in seconds], "o-", label=name)
-            proportional = [seconds[0]["median"] * value / values[0] for value in values]
-            axes.plot(values, proportional, "--", color=line.get_color(), alpha=0.3)
-    axes.set(title=title, xlabel=sweep, ylabel="seconds", xscale="log", yscale="log")
-    axes.legend(frameon=False)
-    with atomic(path) as temporary:
-        figure.savefig(temporary, dpi=100)

@@ -11,11 +11,12 @@ from dataclasses import replace
 import torch
 
 import costs
-from harness import Row, Unavailable, Variant, interleaved, parser, report
+from harness import Row, Unavailable, Variant, interleaved, parser, settings_of
 from nerfdiff.distill.inner_steps import InnerSteps
 from nerfdiff.distill.ray_batches import RayBatches
 from nerfdiff.render.renderer import Renderer
-from render import noise_field
+from render import noise_field, with_samples
+from report import report
 from subjects import Subject, scene, subject
 from variants import renderers
 
@@ -40,8 +41,7 @@ def main(words: list[str] | None = None) -> str:
         "scenes": 1,
     }
     rows: list[Row] = []
-    for value in [None] if arguments.sweep is None else arguments.values or SWEEPS[arguments.sweep]:
-        setting = usual if value is None else usual | {arguments.sweep: value}
+    for setting in settings_of(arguments, usual, SWEEPS):
         rows += _measure(measured, setting, arguments.steps, arguments.seconds)
     settings = usual | {"steps timed at once": arguments.steps}
     notes = ["times are of one step, those of a run divided by its steps, drawing and all"]
@@ -49,8 +49,7 @@ def main(words: list[str] | None = None) -> str:
 
 
 def _measure(measured: Subject, setting: dict[str, int], steps: int, seconds: float) -> list[Row]:
-    samples = setting["samples"]
-    renderer = replace(measured.model.renderer, uniform_samples=samples - samples // 2, importance_samples=samples // 2)
+    renderer = with_samples(measured.model.renderer, setting["samples"])
     variants: dict[str, Variant] = {}
     for name, found in renderers(measured.model, renderer).items():
         for record in (False, True):
@@ -92,6 +91,8 @@ def steps_of(measured: Subject, renderer: Renderer, setting: dict[str, int], ste
     def run():
         with measured.autocast():
             inner.run(steps)
+        if record and measured.device.type == "cuda" and not inner.recorded:
+            raise RuntimeError("the steps could not be recorded as a CUDA graph")
 
     return run
 

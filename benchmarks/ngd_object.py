@@ -4,8 +4,8 @@
     python benchmarks/ngd_object.py --ckpt demo --budget minutes
     python benchmarks/ngd_object.py --model base --budget paper --steps 2 --extrapolate
 
-The reference is the plain renderer, eager U-Nets and no CUDA graph. The last command times 2 diffusion steps and
-computes what all of them would take; its rows say so.
+The reference is the plain renderer, eager U-Nets and no CUDA graph. The last command times objects of 1 and of 2
+diffusion steps and computes what all of them would take; its rows say so.
 """
 
 import copy
@@ -17,15 +17,17 @@ import torch
 from hydra.utils import instantiate
 
 import costs
-from harness import Row, Unavailable, Work, interleaved, parser, report
+from harness import Row, Unavailable, Work, interleaved, parser, settings_of
 from inner_step import steps_of
 from nerfdiff.cli import load_config
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.distillation import Distillation
+from nerfdiff.distill.inner_steps import InnerSteps
 from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.distill.virtual_views import VirtualViews
 from nerfdiff.model import NerfDiff
 from nerfdiff.training import plain
+from report import report
 from subjects import Subject, scene, subject
 from variants import models, renderers
 
@@ -48,8 +50,7 @@ def main(words: list[str] | None = None) -> str:
     budget = plain(_config(arguments, {}).budget)
     usual = {"views": budget["views"], "scenes": arguments.scenes}
     rows: list[Row] = []
-    for value in [None] if arguments.sweep is None else arguments.values or SWEEPS[arguments.sweep]:
-        setting = usual if value is None else usual | {arguments.sweep: value}
+    for setting in settings_of(arguments, usual, SWEEPS):
         rows += _measure(arguments, measured, budget, setting)
     timed = arguments.steps or budget["steps"]
     settings = {"strategy": arguments.strategy, "budget": arguments.budget} | budget | usual | {"steps timed": timed}
@@ -71,32 +72,27 @@ def _config(arguments, setting: dict[str, int]):
 
 def _measure(arguments, measured: Subject, budget: dict[str, int], setting: dict[str, int]) -> list[Row]:
     steps = min(arguments.steps or budget["steps"], budget["steps"])
-    strategy = plain(_config(arguments, setting).strategy)
-    strategy["teacher"]["steps"] = steps
-    method: Distillation = instantiate(strategy)
+    method = _method(arguments, setting, steps)
     scenes = [scene(measured, 1, seed=number) for number in range(setting["scenes"])]
     ways = _ways(measured, arguments.compile)
     rows: list[Row] = []
     if not arguments.whole:
         rows += _parts(measured, ways, method, scenes, budget, setting, arguments.seconds)
-    objects = {
-        name: way if isinstance(way, Unavailable) else _distils(measured, way, method, scenes)
-        for name, way in ways.items()
-    }
-    parts = {row.name: row for row in rows}
-    found = interleaved(objects, measured.device, arguments.seconds)
-    for name, row in found.items():
+    found = _objects(measured, ways, method, scenes, arguments.seconds)
+    for row in found.values():
         row.work = _work(measured, budget, setting, steps)
-        if row.seconds is not None and arguments.extrapolate and steps < budget["steps"]:
-            once = sum(parts[f"{part}, {name}"].seconds["median"] for part in ("encode", "conditions"))
-            once *= setting["scenes"]  # parts are of one
-            row.seconds = {"n": row.seconds["n"]} | {
-                key: _extrapolated(row.seconds[key], once if key == "median" else 0.0, steps, budget["steps"])
-                for key in ("median", "iqr")
-            }
+    if arguments.extrapolate and steps < budget["steps"]:
+        fewer = steps // 2
+        short = _objects(measured, ways, _method(arguments, setting, fewer), scenes, arguments.seconds)
+        ran = {name: row for name, row in found.items() if row.seconds and short[name].seconds}
+        for name, row in ran.items():
+            medians = {fewer: short[name].seconds["median"], steps: row.seconds["median"]}
+            row.seconds["median"] = extrapolated(medians, budget["steps"])
+            row.seconds["iqr"] *= budget["steps"] / steps
             row.work = _work(measured, budget, setting, budget["steps"])
             row.more["extrapolated from steps"] = steps
-            row.ratio = found[next(iter(found))].seconds["median"] / row.seconds["median"]
+            row.ratio = next(iter(ran.values())).seconds["median"] / row.seconds["median"]
+    for name, row in found.items():
         row.name = f"{setting['scenes']} objects, {name}" if setting["scenes"] > 1 else f"object, {name}"
         if row.seconds is not None:
             row.more["s/object"] = row.seconds["median"] / setting["scenes"]
@@ -107,9 +103,25 @@ def _measure(arguments, measured: Subject, budget: dict[str, int], setting: dict
     return rows
 
 
-def _extrapolated(seconds: float, once: float, steps: int, all_steps: int) -> float:
-    """What is done once per object, and every step as those that were timed."""
-    return once + (seconds - once) * all_steps / steps
+def extrapolated(seconds: dict[int, float], steps: int) -> float:
+    """Seconds of `steps` steps on the line through two measurements {steps: seconds}: what is done once per object,
+    setting up the loop included, is not multiplied."""
+    (few, short), (more, long) = sorted(seconds.items())
+    return short + (long - short) / (more - few) * (steps - few)
+
+
+def _method(arguments, setting: dict[str, int], steps: int) -> Distillation:
+    strategy = plain(_config(arguments, setting).strategy)
+    strategy["teacher"]["steps"] = steps
+    return instantiate(strategy)
+
+
+def _objects(measured: Subject, ways, method: Distillation, scenes: Sequence[ViewBatch], seconds: float):
+    calls = {
+        name: way if isinstance(way, Unavailable) else _distils(measured, way, method, scenes)
+        for name, way in ways.items()
+    }
+    return interleaved(calls, measured.device, seconds)
 
 
 def _ways(measured: Subject, compiled: bool) -> dict[str, Way | Unavailable]:
@@ -134,6 +146,8 @@ def _distils(measured: Subject, way: Way, method: Distillation, scenes: Sequence
     def call():
         with measured.autocast():
             own.distil(way.model, scenes, 0)
+        if way.cuda_graphs and measured.device.type == "cuda" and not InnerSteps.recording:
+            raise RuntimeError("its inner steps could not be recorded as a CUDA graph")
 
     return call
 
@@ -237,8 +251,8 @@ def _arguments(words):
         "--compile", action="store_true", help="also with compiled U-Nets; the first call takes up to minutes"
     )
     arguments = made.parse_args(words)
-    if arguments.extrapolate and (arguments.whole or not arguments.steps):
-        made.error("--extrapolate needs --steps, and the parts that --whole leaves out")
+    if arguments.extrapolate and (arguments.steps or 0) < 2:
+        made.error("--extrapolate needs --steps of at least 2")
     return arguments
 
 

@@ -11,12 +11,13 @@ from dataclasses import replace
 import torch
 
 import costs
-from harness import Row, Unavailable, Variant, interleaved, parser, report
+from harness import Row, Unavailable, Variant, interleaved, parser, settings_of
 from nerfdiff.cameras import Rays
 from nerfdiff.distill.ray_batches import RayBatches
 from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.render.renderer import Renderer
+from report import report
 from subjects import Subject, scene, subject
 from variants import renderers
 
@@ -39,8 +40,7 @@ def main(words: list[str] | None = None) -> str:
         "scenes": 1,
     }
     rows: list[Row] = []
-    for value in [None] if arguments.sweep is None else arguments.values or SWEEPS[arguments.sweep]:
-        setting = usual if value is None else usual | {arguments.sweep: value}
+    for setting in settings_of(arguments, usual, SWEEPS):
         for backward in (False, True):
             rows += _measure(measured, setting, backward, arguments.seconds)
     notes = ["FLOP of the gathers and the decoder, without recomputing; MB is the least that must move"]
@@ -48,8 +48,7 @@ def main(words: list[str] | None = None) -> str:
 
 
 def _measure(measured: Subject, setting: dict[str, int], backward: bool, seconds: float) -> list[Row]:
-    samples = setting["samples"]
-    renderer = replace(measured.model.renderer, uniform_samples=samples - samples // 2, importance_samples=samples // 2)
+    samples, renderer = setting["samples"], with_samples(measured.model.renderer, setting["samples"])
     field = noise_field(measured, setting["plane"], setting["scenes"])
     rays = random_rays(measured, field, setting["rays"])
     jitter = torch.rand(*rays.near.shape, samples, device=measured.device)
@@ -65,6 +64,11 @@ def _measure(measured: Subject, setting: dict[str, int], backward: bool, seconds
         if row.seconds is not None:
             row.more["rays/s"] = setting["rays"] * setting["scenes"] / row.seconds["median"]
     return list(rows.values())
+
+
+def with_samples(renderer: Renderer, samples: int) -> Renderer:
+    """Half of them, or one less, drawn by importance."""
+    return replace(renderer, uniform_samples=samples - samples // 2, importance_samples=samples // 2)
 
 
 def noise_field(measured: Subject, plane: int, scenes: int) -> RefinedField:

@@ -15,13 +15,14 @@ from types import SimpleNamespace
 import torch
 
 import costs
-from harness import Row, Unavailable, Variant, interleaved, parser, report
+from harness import Row, Unavailable, Variant, interleaved, parser, settings_of
 from nerfdiff.cli import load_config
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.memory import largest_batch
 from nerfdiff.modules.nerfdiff_module import NerfDiffModule
 from nerfdiff.render.renderer import Renderer
 from nerfdiff.training import plain
+from report import report
 from subjects import Subject, scene, subject
 from variants import as_kind, kinds, renderers
 
@@ -47,8 +48,7 @@ def main(words: list[str] | None = None) -> str:
     cfg = load_config("train", [f"model={arguments.model}", "data=srn_cars", *arguments.overrides])
     usual = {"batch": arguments.batch or cfg.data.batch_size}
     rows: list[Row] = []
-    for value in [None] if arguments.sweep is None else arguments.values or SWEEPS[arguments.sweep]:
-        setting = usual if value is None else {arguments.sweep: value}
+    for setting in settings_of(arguments, usual, SWEEPS):
         rows += _measure(measured, cfg, setting["batch"], arguments.compile, arguments.seconds)
     settings = usual | {"targets": cfg.data.target_views}
     notes = ["FLOP without what is recomputed: the share of the matrix rate is the model's, not the device's, work"]

@@ -11,8 +11,9 @@ from dataclasses import replace
 import torch
 
 import costs
-from harness import Row, Variant, interleaved, parser, report
+from harness import Row, Variant, interleaved, parser, settings_of
 from nerfdiff.render.renderer import Rendering
+from report import report
 from subjects import Subject, scene, subject
 from variants import models
 
@@ -26,8 +27,8 @@ def main(words: list[str] | None = None) -> str:
     rows: list[Row] = []
     if arguments.sweep is None:
         rows += _encoder(measured, arguments.compile, arguments.seconds)
-    for views in [arguments.views] if arguments.sweep is None else arguments.values or SWEEPS["views"]:
-        rows += _denoiser(measured, views, arguments.compile, arguments.seconds)
+    for setting in settings_of(arguments, {"views": arguments.views}, SWEEPS):
+        rows += _denoiser(measured, setting["views"], arguments.compile, arguments.seconds)
     notes = ["MB is what operators read and write one by one; fused ones move less"]
     settings = {"views": arguments.views}
     return str(report("unet", measured, rows, limit, settings, arguments.out, notes, arguments.sweep))

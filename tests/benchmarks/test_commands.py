@@ -70,11 +70,11 @@ def test_unet_times_encoder_and_denoiser(tmp_path):
 
 
 def test_ngd_object_times_an_object_and_its_parts(tmp_path):
-    budget = ["--sweep", "views", "--values", "2", "--steps", "1"]
+    budget = ["--sweep", "views", "--values", "2", "--steps", "2"]
     content = run(ngd_object, tmp_path, *budget, "--extrapolate")
     rows, steps = ran(content), content["settings"]["steps"]
     whole = rows["object, reference"]
-    assert whole["more"]["extrapolated from steps"] == 1 and f"1 of {steps}" in content["notes"][0]
+    assert whole["more"]["extrapolated from steps"] == 2 and f"2 of {steps}" in content["notes"][0]
     assert whole["more"]["objects/min"] == pytest.approx(60 / whole["seconds"]["median"])
     parts = {name.rpartition(", ")[0]: row for name, row in rows.items() if name.endswith("reference")}
     once = parts["encode"]["work"]["flops"] + parts["conditions"]["work"]["flops"]
@@ -92,13 +92,15 @@ def test_what_is_timed_in_part_is_said(tmp_path):
 
 
 def test_extrapolating_asks_for_what_it_needs():
-    for words in (["--extrapolate"], ["--extrapolate", "--steps", "2", "--whole"]):
+    for words in (["--extrapolate"], ["--extrapolate", "--steps", "1"]):
         with pytest.raises(SystemExit):
             ngd_object.main(words)
 
 
 def test_extrapolation_repeats_the_steps_alone():
-    assert ngd_object._extrapolated(7.0, 1.0, steps=2, all_steps=16) == 1 + 16 * 3
+    once, each = 5.0, 3.0
+    measured = {steps: once + each * steps for steps in (2, 4)}
+    assert ngd_object.extrapolated(measured, 64) == pytest.approx(once + each * 64)
 
 
 def test_training_step_times_a_step_and_finds_the_largest_batch(tmp_path):

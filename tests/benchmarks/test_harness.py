@@ -10,7 +10,8 @@ from torch import nn
 
 import costs
 import harness
-from harness import Limits, Row, Unavailable, Work, interleaved, report
+import report
+from harness import Limits, Row, Unavailable, Work, interleaved
 from model_fixtures import CONFIG, model
 from nerfdiff.render.renderer import Renderer
 from nerfdiff.results import timing
@@ -91,10 +92,10 @@ def test_the_file_says_what_was_measured_on_what(tmp_path, capsys):
     rows = [Row("plain", {"rays": n}, {"n": 3, "median": n / 10, "iqr": 0.01}, 1.0, Work(2e9, 4e8)) for n in (1, 2)] + [
         Row("fused", {"rays": n}, reason="needs wings") for n in (1, 2)
     ]
-    path = report("render", subject, rows, Limits(1e10, 1e12, "float32"), {"K": 3}, tmp_path, ["a note"], "rays")
+    path = report.report("render", subject, rows, Limits(1e10, 1e12, "float32"), {"K": 3}, tmp_path, ["a note"], "rays")
     content = json.loads(path.read_text())
     facts = content["environment"]
-    assert path.name == f"render-rays-toy-model-{harness.slug(facts['cpu'])}-{content['time'][:10]}.json"
+    assert path.name == f"render-rays-toy-model-{report.slug(facts['cpu'])}-{content['time'][:10]}.json"
     assert path.with_suffix(".png").stat().st_size > 1000
     assert {"torch", "threads", "git_sha", "git_dirty", "precision"} <= facts.keys()
     assert content["model"] == "toy model" and content["parameters"]["total"] > 0 and content["settings"] == {"K": 3}
@@ -110,7 +111,7 @@ def test_the_file_says_what_was_measured_on_what(tmp_path, capsys):
     ("seconds", "text"), [(2.5, "2.5 s"), (0.0123, "12.3 ms"), (4.2e-5, "42 µs"), (0.0, "0 µs"), (1234.5, "1,234 s")]
 )
 def test_durations_are_read_at_a_glance(seconds, text):
-    assert harness.duration(seconds) == text
+    assert report.duration(seconds) == text
 
 
 def test_a_convolution_counts_two_operations_for_every_product():

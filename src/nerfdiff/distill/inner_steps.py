@@ -58,6 +58,11 @@ class InnerSteps:
         """Points of one scene at which a step evaluates its field."""
         return self.rays * self.renderer.samples_per_ray
 
+    @property
+    def recorded(self) -> bool:
+        """Whether steps are replayed from a CUDA graph."""
+        return self._graph is not None
+
     def run(self, steps: int) -> Float[Tensor, "{steps} scenes"]:
         """Take `steps` steps; the mean squared error of each, before it."""
         self._draw(steps)

@@ -18,7 +18,9 @@ import costs
 from harness import Row, Unavailable, Variant, interleaved, parser, settings_of
 from nerfdiff.cli import load_config
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.memory import largest_batch
+from nerfdiff.diffusion.unet import AUTO
+from nerfdiff.memory import largest_batch, within_memory
+from nerfdiff.model import NerfDiff
 from nerfdiff.modules.nerfdiff_module import NerfDiffModule
 from nerfdiff.render.renderer import Renderer
 from nerfdiff.training import plain
@@ -43,20 +45,33 @@ class Alone(NerfDiffModule):
 
 def main(words: list[str] | None = None) -> str:
     arguments = _arguments(words)
-    measured = subject(arguments)
-    limit = measured.limits(arguments.seconds)
     cfg = load_config("train", [f"model={arguments.model}", "data=srn_cars", *arguments.overrides])
     usual = {"batch": arguments.batch or cfg.data.batch_size}
+    measured = _settled(subject(arguments), cfg, usual["batch"])
+    limit = measured.limits(arguments.seconds)
     rows: list[Row] = []
     for setting in settings_of(arguments, usual, SWEEPS):
         rows += _measure(measured, cfg, setting["batch"], arguments.compile, arguments.seconds)
-    settings = usual | {"targets": cfg.data.target_views}
+    settings = usual | {"targets": cfg.data.target_views, "checkpointing": measured.config["unet"]["checkpointing"]}
     notes = ["FLOP without what is recomputed: the share of the matrix rate is the model's, not the device's, work"]
     if arguments.memory is not None:
         found = largest_batches(measured, cfg, arguments.memory)
         settings |= found
         notes += [f"{name}: {batch}" for name, batch in found.items()]
     return str(report("training_step", measured, rows, limit, settings, arguments.out, notes, arguments.sweep))
+
+
+def _settled(measured: Subject, cfg, batch: int) -> Subject:
+    """With the recomputing that a training run of this batch would choose here, where that is its to choose."""
+    if measured.config["unet"]["checkpointing"] != AUTO:
+        return measured
+    size = measured.size, measured.size
+    step = measured.device, batch, cfg.data.target_views, *size, measured.precision
+    config = within_memory(measured.config, *step)
+    with measured.device:
+        model = NerfDiff(**config).eval()
+    model.load_state_dict(measured.model.state_dict())
+    return replace(measured, config=config, model=model)
 
 
 def _measure(measured: Subject, cfg, batch: int, compiled: bool, seconds: float) -> list[Row]:

@@ -12,6 +12,7 @@ from nerfdiff.render.kernels import passes
 from nerfdiff.render.kernels.arguments import Settings
 from nerfdiff.render.kernels.function import fused_render
 from nerfdiff.render.renderer import Renderer
+from nerfdiff.render.sampling import KEPT
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 NAMES = ("planes", "w1", "b1", "w2", "b2", "origins", "directions")
@@ -39,6 +40,7 @@ class Case:
     importance: int = 3
     background: float | None = 1.0
     jittered: bool = True
+    cached: bool = False
     own_decoders: bool = False
     shift: float = -1.0
     scale: float = 8.0
@@ -70,6 +72,9 @@ class Case:
         samples = self.uniform + self.importance
         self.jitter = torch.rand(scenes, n, samples, generator=g) if self.jittered else None
         self.d_outputs = normal(scenes, n, 3), normal(scenes, n), normal(scenes, n)
+        # as of an earlier look, which need not have met what is there now
+        weights = torch.rand(scenes, n, self.uniform, generator=g).pow(4).to(KEPT)
+        self.coarse = weights if self.cached else None
 
     @property
     def renderer(self) -> Renderer:
@@ -93,17 +98,20 @@ class Case:
         field = self.field(leaves)
         decoder = (field.decoder.hidden.weight, field.decoder.hidden.bias)
         leaves[1:5] = *decoder, field.decoder.output.weight, field.decoder.output.bias
-        out = self.renderer.render(field, self.rays(leaves), None if self.jitter is None else self.jitter.to(dtype))
+        jitter = None if self.jitter is None else self.jitter.to(dtype)
+        out = self.renderer.render(field, self.rays(leaves), jitter, self.coarse)
         return _with_gradients([out.rgb, out.opacity, out.depth], leaves, self.d_outputs)
 
     def settings(self, precision: str = "ieee", ordered: bool = False, points: int = 10**6) -> Settings:
         samples = self.uniform, self.importance, self.background
         return Settings(*samples, points, points, precision, ordered, *IMAGE, self.shift, self.scale)
 
-    def render(self, leaves, settings: Settings):
-        """Outputs of the kernels for these leaves."""
-        fixed = (self.K, self.near, self.far, self.ray_near, self.ray_far, self.jitter)
-        return fused_render(settings, _no_recovery, *leaves, *(None if t is None else t.to(DEVICE) for t in fixed))
+    def render(self, leaves, settings: Settings, keep_coarse: bool = False):
+        """Colour, opacity and depth by the kernels for these leaves; and coarse weights where they are to be kept."""
+        fixed = (self.K, self.near, self.far, self.ray_near, self.ray_far, self.jitter, self.coarse)
+        there = (None if t is None else t.to(DEVICE) for t in fixed)
+        outputs = fused_render(settings, _no_recovery, keep_coarse, *leaves, *there)
+        return outputs if keep_coarse else outputs[:3]
 
     def fused(self, **settings) -> tuple[list[torch.Tensor], dict[str, torch.Tensor]]:
         """Outputs and gradients by the kernels."""

@@ -6,7 +6,7 @@ import torch
 from model_fixtures import config
 from nerfdiff import memory
 from nerfdiff.errors import ConfigError
-from nerfdiff.memory import PeakMemory, TrainingMemory, is_tight, require_memory, training_memory
+from nerfdiff.memory import HEADROOM, PeakMemory, TrainingMemory, is_tight, training_memory, within_memory
 from nerfdiff.model import build_on_meta
 
 
@@ -68,8 +68,27 @@ def test_the_largest_batch_of_a_traced_model_fits_and_one_more_does_not():
 def test_what_does_not_fit_is_refused_with_what_it_takes(monkeypatch):
     monkeypatch.setattr(memory, "free_memory", lambda device: 10**6)
     with pytest.raises(ConfigError, match=r"training takes about .* cpu has 0\.0 GiB free.*accumulate_grad_batches"):
-        require_memory(config(), torch.device("cpu"), 1, 1, 16, 16, "32-true")
+        within_memory(config(), torch.device("cpu"), 1, 1, 16, 16, "32-true")
     assert is_tight(config(), torch.device("cpu"))
     monkeypatch.setattr(memory, "free_memory", lambda device: 10**15)
-    require_memory(config(), torch.device("cpu"), 1, 1, 16, 16, "32-true")
+    assert within_memory(config(), torch.device("cpu"), 1, 1, 16, 16, "32-true") == config()
     assert not is_tight(config(), torch.device("cpu"))
+
+
+@pytest.mark.parametrize("choice", [False, [1], True])
+def test_no_more_is_recomputed_than_memory_asks_for(choice, monkeypatch):
+    step = 8, 1, 16, 16, "32-true"
+    needed = training_memory(config(unet={"checkpointing": choice}), *step).total
+    monkeypatch.setattr(memory, "free_memory", lambda device: int(needed / HEADROOM) + 1)
+    settled = within_memory(config(unet={"checkpointing": "auto"}), torch.device("cpu"), *step)
+    assert settled == config(unet={"checkpointing": choice})
+
+
+def test_where_recomputing_everything_is_not_enough_the_run_is_refused(monkeypatch):
+    step = 8, 1, 16, 16, "32-true"
+    needed = training_memory(config(unet={"checkpointing": True}), *step).total
+    monkeypatch.setattr(memory, "free_memory", lambda device: needed - 1)
+    with pytest.raises(ConfigError, match="training takes about"):
+        within_memory(config(unet={"checkpointing": "auto"}), torch.device("cpu"), *step)
+    monkeypatch.setattr(memory, "free_memory", lambda device: needed)
+    assert within_memory(config(unet={"checkpointing": "auto"}), torch.device("cpu"), *step)["unet"]["checkpointing"]

@@ -35,7 +35,7 @@ KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
 EITHER: dict[str, tuple[type, ...]] = {
     "image_size": (int, list),  # one side of a square, or [height, width]
     "crop": (int, list),
-    "checkpointing": (bool, list),  # everywhere or nowhere, or at some resolutions
+    "checkpointing": (bool, list, str),  # everywhere or nowhere, at some resolutions, or auto
 }
 OPTIONAL_GROUPS = ("logger", "experiment", "sweep")
 

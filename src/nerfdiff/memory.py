@@ -13,6 +13,7 @@ from torch.utils._pytree import tree_leaves
 from torch.utils.weak import WeakIdKeyDictionary
 
 from nerfdiff.cameras import Cameras
+from nerfdiff.diffusion.unet import AUTO
 from nerfdiff.errors import ConfigError
 from nerfdiff.model import NerfDiff, build_on_meta
 
@@ -20,6 +21,8 @@ log = logging.getLogger(__name__)
 
 WEIGHTS_ADAM_EMA = 4 * 4
 """Bytes per parameter that stay: fp32 weights, Adam's two moments, the average."""
+HEADROOM = 0.85
+"""Share of what is free that is planned with, where recomputing more is the alternative to running out."""
 
 
 class PeakMemory(TorchDispatchMode):
@@ -194,7 +197,7 @@ def is_tight(model_config: Mapping, device: torch.device) -> bool:
     return 4 * WEIGHTS_ADAM_EMA * parameters >= free_memory(device)
 
 
-def require_memory(
+def within_memory(
     model_config: Mapping,
     device: torch.device,
     batch_size: int,
@@ -202,8 +205,9 @@ def require_memory(
     height: int,
     width: int,
     precision: str,
-) -> None:
-    """Refuse a run that the device cannot hold before hours or the machine are lost to it.
+) -> dict:
+    """The settings with which a run fits: `unet.checkpointing=auto` becomes as little recomputing as memory asks for,
+    and a run that the device cannot hold is refused before hours or the machine are lost to it.
 
     Args:
         model_config, batch_size, precision: as for `training_memory`.
@@ -211,8 +215,18 @@ def require_memory(
     Raises:
         ConfigError: it takes more than is free on `device`; the message says how much, for what, and what takes less.
     """
-    free = free_memory(device)
-    needed = training_memory(model_config, batch_size, target_views, height, width, precision)
+    free, unet = free_memory(device), model_config["unet"]
+    automatic = unet["checkpointing"] == AUTO
+    choices = [unet["checkpointing"]]
+    if automatic:
+        most = [2**level for level in range(len(unet["channel_mult"]))]
+        # the largest images first: they hold the most, and cost no more to compute anew
+        choices = [False, *(most[: count + 1] for count in range(len(most) - 1)), True]
+    for choice in choices:
+        settled = dict(model_config) | {"unet": dict(unet) | {"checkpointing": choice}}
+        needed = training_memory(settled, batch_size, target_views, height, width, precision)
+        if needed.total <= free * (HEADROOM if automatic else 1):
+            break
     state, step, available = (amount / 2**30 for amount in (needed.state, needed.step, free))
     told = (
         f"training takes about {state + step:.1f} GiB: {state:.1f} of weights, Adam and EMA, and {step:.1f} "
@@ -225,7 +239,8 @@ def require_memory(
             "through in N parts, model.unet.checkpointing=true (or, say, [1,2]: where images are as large as the input "
             "or half) and a smaller model.render.chunk recompute more and keep less"
         )
-    log.info("%s", told)
+    log.info("%s", f"{told} (model.unet.checkpointing={choice})" if automatic else told)
+    return settled
 
 
 def free_memory(device: torch.device) -> int:

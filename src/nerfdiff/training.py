@@ -15,8 +15,9 @@ from nerfdiff.callbacks.checkpoint import ClearCheckpointIO
 from nerfdiff.checkpoint import check_resumable, export_model, last_checkpoint, load_model
 from nerfdiff.compilation import compile_unets
 from nerfdiff.data.datamodule import SceneDataModule
+from nerfdiff.diffusion.unet import AUTO
 from nerfdiff.errors import CheckpointError, ConfigError
-from nerfdiff.memory import WEIGHTS_ADAM_EMA, is_tight, require_memory
+from nerfdiff.memory import WEIGHTS_ADAM_EMA, is_tight, within_memory
 from nerfdiff.modules.nerfdiff_module import NerfDiffModule
 
 log = logging.getLogger(__name__)
@@ -45,7 +46,7 @@ def train(cfg: DictConfig) -> dict[str, float]:
 
     trainer = build_trainer(cfg)
     datamodule = instantiate(cfg.data)
-    _require_memory(model_config, trainer, datamodule)
+    model_config = _within_memory(model_config, trainer, datamodule)
     module = NerfDiffModule(
         model=model_config,
         losses=plain(cfg.losses),
@@ -54,7 +55,7 @@ def train(cfg: DictConfig) -> dict[str, float]:
         channels_last=cfg.channels_last,
         seed=cfg.seed,
     )
-    module.model.renderer = replace(module.model.renderer, backend=cfg.backend)
+    module.model.renderer = replace(module.model.renderer, backend=cfg.backend, kernel_precision=cfg.kernel_precision)
     compile_unets(module.model, cfg.compile, cfg.paths.compiled_dir)
     if trainer.is_global_zero:
         output_dir.mkdir(parents=True, exist_ok=True)
@@ -73,14 +74,14 @@ def train(cfg: DictConfig) -> dict[str, float]:
     return {name: float(value) for name, value in trainer.callback_metrics.items()}
 
 
-def _require_memory(model_config: dict, trainer: Trainer, data: SceneDataModule) -> None:
+def _within_memory(model_config: dict, trainer: Trainer, data: SceneDataModule) -> dict:
     device = trainer.strategy.root_device
-    if not is_tight(model_config, device):
-        return
+    if model_config["unet"]["checkpointing"] != AUTO and not is_tight(model_config, device):
+        return model_config
     first = data.reader("train").load(0, [0]).cameras
     batch_size = max(1, data.batch_size // (trainer.world_size * trainer.accumulate_grad_batches))
     size = first.height, first.width
-    require_memory(model_config, device, batch_size, data.target_views, *size, trainer.precision)
+    return within_memory(model_config, device, batch_size, data.target_views, *size, trainer.precision)
 
 
 def build_trainer(cfg: DictConfig) -> Trainer:

@@ -59,6 +59,7 @@ def test_inner_step_times_a_step_of_several_scenes(tmp_path):
     words = ["--rays", "16", "--views", "2", "--steps", "2", "--sweep", "scenes", "--values", "1", "2"]
     content = run(inner_step, tmp_path, *words)
     one, two = (row for row in content["rows"] if row["name"] == "torch")
+    assert "torch, coarse kept" in ran(content)
     assert two["work"]["bytes"] == 2 * one["work"]["bytes"]
     assert two["more"]["steps/s, all scenes"] == pytest.approx(2 / two["seconds"]["median"])
 

@@ -97,7 +97,7 @@ def test_checkpointing_changes_memory_not_gradients(checkpointing):
 
 
 @pytest.mark.parametrize(
-    ("checkpointing", "sizes"), [(False, set()), (True, {8, 4}), ([1], {8}), ([2], {4}), ([], set())]
+    ("checkpointing", "sizes"), [(False, set()), (True, {8, 4}), ("auto", {8, 4}), ([1], {8}), ([2], {4}), ([], set())]
 )
 def test_only_the_chosen_resolutions_are_recomputed(checkpointing, sizes):
     net, runs = unet(checkpointing=checkpointing), {8: 0, 4: 0}
@@ -113,9 +113,9 @@ def test_only_the_chosen_resolutions_are_recomputed(checkpointing, sizes):
     assert all(runs[size] == once[size] for size in runs if size not in sizes)
 
 
-@pytest.mark.parametrize("checkpointing", [[3], [1, 4]])
+@pytest.mark.parametrize("checkpointing", [[3], [1, 4], "flase"])
 def test_a_resolution_that_there_is_not_is_refused(checkpointing):
-    with pytest.raises(ConfigError, match=r"must be true, false, or some of \[1, 2\]"):
+    with pytest.raises(ConfigError, match=r"must be auto, true, false, or some of \[1, 2\]"):
         unet(checkpointing=checkpointing)
 
 

@@ -32,10 +32,18 @@ def views(scenes: int, count: int = 2) -> Cameras:
     return Cameras(places.expand(scenes, count, 4, 4), K.expand(scenes, count, 3, 3), SIZE, SIZE)
 
 
-def inner_steps(field: RefinedField, images: torch.Tensor, rays: int = RAYS, record: bool = False) -> InnerSteps:
+def inner_steps(
+    field: RefinedField,
+    images: torch.Tensor,
+    rays: int = RAYS,
+    record: bool = False,
+    coarse: torch.Tensor | None = None,
+) -> InnerSteps:
     device = field.planes.device
     batches = RayBatches(views(len(field)).to(device), field.near, field.far)
     batches.paint(images)
+    if coarse is not None:
+        batches.remember(coarse)
     rates = torch.tensor([1e-2, 1e-3], device=device)
     optimizer = torch.optim.Adam(
         [{"params": [field.planes], "lr": rates[0]}, {"params": list(field.decoder.parameters()), "lr": rates[1]}],
@@ -46,10 +54,12 @@ def inner_steps(field: RefinedField, images: torch.Tensor, rays: int = RAYS, rec
     return InnerSteps(field, RENDERER, batches, optimizer, rays, generators, record)
 
 
-def test_steps_are_those_of_a_plain_loop_over_each_scene_by_itself():
+@pytest.mark.parametrize("remembered", [False, True])
+def test_steps_are_those_of_a_plain_loop_over_each_scene_by_itself(remembered):
     field, images = fields(2), torch.rand(2, 2, 3, SIZE, SIZE)
+    coarse = torch.rand(2, 2, SIZE, SIZE, RENDERER.uniform_samples).pow(4) if remembered else None
     references = [copy.deepcopy(field.alone(scene)) for scene in range(2)]
-    losses = inner_steps(field, images).run(STEPS)
+    losses = inner_steps(field, images, coarse=coarse).run(STEPS)
     for scene, reference in enumerate(references):
         draws = torch.Generator().manual_seed(scene)
         picked = torch.empty(STEPS, RAYS, dtype=torch.long).random_(2 * SIZE**2, generator=draws)
@@ -69,7 +79,8 @@ def test_steps_are_those_of_a_plain_loop_over_each_scene_by_itself():
                 rays.near.expand(shape)[view, row, column][None],
                 rays.far.expand(shape)[view, row, column][None],
             )
-            rgb = RENDERER.render(reference.field(), chosen, jitter[step][None]).rgb[0]
+            seen = None if coarse is None else coarse[scene, view, row, column][None]
+            rgb = RENDERER.render(reference.field(), chosen, jitter[step][None], seen).rgb[0]
             loss = F.mse_loss(rgb, colours[view, row, column])
             optimizer.zero_grad()
             loss.backward()
@@ -92,6 +103,15 @@ def test_painting_changes_what_is_fitted_and_drawing_goes_on():
     assert inner.batches.at(inner._picked[:, 0])[1].eq(0).all()
 
 
+def test_what_is_remembered_anew_stays_in_its_place():
+    """A recorded step reads memory, not names."""
+    inner = inner_steps(fields(1), torch.rand(1, 2, 3, SIZE, SIZE), coarse=torch.zeros(1, 2, SIZE, SIZE, 4))
+    before = inner.batches._coarse.data_ptr()
+    inner.batches.remember(torch.ones(1, 2, SIZE, SIZE, 4))
+    assert inner.batches._coarse.data_ptr() == before
+    assert inner.batches.coarse_at(torch.tensor([[3, 500]])).eq(1).all()
+
+
 def test_no_step_is_no_loss_and_no_change():
     field = fields(1)
     before = field.planes.detach().clone()
@@ -105,11 +125,16 @@ def test_one_ray_is_enough():
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
-def test_a_recorded_step_does_what_the_step_does():
+@pytest.mark.parametrize("remembered", [False, True])
+def test_a_recorded_step_does_what_the_step_does(remembered):
     images = torch.rand(2, 2, 3, SIZE, SIZE, device="cuda")
     field, recorded = fields(2, "cuda"), fields(2, "cuda")
     plain, replayed = inner_steps(field, images), inner_steps(recorded, images, record=True)
     for _ in range(2):  # the second time, everything is replayed
+        if remembered:
+            coarse = torch.rand(2, 2, SIZE, SIZE, RENDERER.uniform_samples, device="cuda").pow(4)
+            plain.batches.remember(coarse)
+            replayed.batches.remember(coarse)
         torch.testing.assert_close(replayed.run(8), plain.run(8), atol=1e-5, rtol=1e-3)
         replayed.optimizer.param_groups[0]["lr"].mul_(0.5)
         plain.optimizer.param_groups[0]["lr"].mul_(0.5)

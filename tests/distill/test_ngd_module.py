@@ -12,10 +12,12 @@ from nerfdiff.distill.direct import SampledViews
 from nerfdiff.distill.distillation import Distillation
 from nerfdiff.distill.guidance import Guidance
 from nerfdiff.distill.ngd import GuidedViews
+from nerfdiff.distill.ray_batches import RayBatches
+from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.distill.sds import DenoisedRenderings
 from nerfdiff.distill.stochastic import AutoregressiveViews
 from nerfdiff.errors import ConfigError
-from nerfdiff.modules.ngd_module import NGDModule
+from nerfdiff.modules.ngd_module import LOOKS, NGDModule
 
 
 def scene(name: str = "a") -> ViewBatch:
@@ -72,6 +74,7 @@ def distillation(teacher, views=3, inner_steps=3, rays=64, lr_planes=1e-2, **mor
         "fit_source": False,
         "target_tolerance": 1.0,
         "source_tolerance": 10.0,
+        "coarse": "every_step",
         "cuda_graphs": True,
         "views_at_once": 2,
     } | more
@@ -96,10 +99,15 @@ def test_every_teacher_fits_the_field_and_leaves_the_model_alone(teacher):
     assert not torch.equal(other.field.planes, module.field.planes)
 
 
-@pytest.mark.parametrize(("teacher", "fit_source"), [(name, name.startswith("ngd")) for name in TEACHERS])
-def test_a_scene_does_not_depend_on_its_company(teacher, fit_source):
+@pytest.mark.parametrize(
+    ("teacher", "fit_source", "coarse"),
+    [(name, name.startswith("ngd"), "every_step") for name in TEACHERS] + [("ngd", True, "refresh")],
+)
+def test_a_scene_does_not_depend_on_its_company(teacher, fit_source, coarse):
     net = model(conditioning={"residual_std": 0.2}).requires_grad_(False)
-    method = distillation(TEACHERS[teacher], lr_decay="linear", fit_source=fit_source, lr_planes=1e-3, lr_decoder=1e-3)
+    method = distillation(
+        TEACHERS[teacher], lr_decay="linear", fit_source=fit_source, coarse=coarse, lr_planes=1e-3, lr_decoder=1e-3
+    )
     scenes = [scene("a"), scene("b")]
     together = method.distil(net, scenes, seed=0)
     for number, own in enumerate(scenes):
@@ -164,6 +172,61 @@ def test_learning_rates_fall_with_the_steps(decay, factors, monkeypatch):
     monkeypatch.setattr(NGDModule, "_fit", watched)
     distillation(TEACHERS["ngd"], lr_decay=decay).distil(model().requires_grad_(False), [scene()], seed=0)
     assert rates == [pytest.approx([1e-2 * factor, 1e-4 * factor]) for factor in factors]
+
+
+@pytest.mark.parametrize("fit_source", [False, True])
+def test_coarse_weights_are_those_of_the_last_refresh(fit_source, monkeypatch):
+    """Inner steps are given the weights of the field that guidance rendered, ray by ray, and not of a later one."""
+    net = model(conditioning={"residual_std": 0.2}).requires_grad_(False)
+    renderings, checked = [], []
+    render, at = RefinedField.render, RayBatches.coarse_at
+
+    def noted(self, *args, **kwargs):
+        renderings.append(render(self, *args, **kwargs))
+        return renderings[-1]
+
+    def compared(self, picked):
+        given = at(self, picked)
+        views = 4 if fit_source else 3
+        last = next(r.coarse for r in reversed(renderings) if r.coarse is not None)
+        assert last.shape == (1, views, 16, 16, net.renderer.uniform_samples)
+        assert torch.equal(given, last.flatten(1, 3)[:, picked[0]])
+        checked.append(last)
+        return given
+
+    monkeypatch.setattr(RefinedField, "render", noted)
+    monkeypatch.setattr(RayBatches, "coarse_at", compared)
+    method = distillation(TEACHERS["ngd"], coarse="refresh", fit_source=fit_source, inner_steps=3)
+    assert method.distil(net, [scene()], seed=0).statuses == ["ok"]
+    assert len(checked) == 4 * 3
+    assert not torch.equal(checked[0], checked[-1])
+
+
+def test_the_input_view_is_looked_at_too_where_it_is_fitted():
+    net = model().requires_grad_(False)
+    queries = {
+        (coarse, fit_source): distillation(TEACHERS["ngd"], coarse=coarse, fit_source=fit_source)
+        .distil(net, [scene()], 0)
+        .views[0]
+        .field_queries
+        for coarse in LOOKS
+        for fit_source in (False, True)
+    }
+    view = 16 * 16 * net.renderer.samples_per_ray
+    assert queries["refresh", False] == queries["every_step", False]
+    assert queries["refresh", True] == queries["every_step", True] + 4 * view
+
+
+@pytest.mark.parametrize("teacher", ["direct", "stochastic"])
+def test_where_nothing_is_rendered_on_the_way_every_step_looks_for_itself(teacher):
+    net = model().requires_grad_(False)
+    every, kept = (distillation(TEACHERS[teacher], coarse=c).distil(net, [scene()], seed=0) for c in LOOKS)
+    assert torch.equal(every.field.planes, kept.field.planes)
+
+
+def test_an_unknown_look_is_refused_with_the_known_ones():
+    with pytest.raises(ConfigError, match=r"strategy.coarse='never': choose every_step, refresh"):
+        distillation(TEACHERS["ngd"], coarse="never").distil(model().requires_grad_(False), [scene()], seed=0)
 
 
 def test_an_unknown_decay_is_refused_with_the_known_ones():

@@ -11,7 +11,7 @@ from nerfdiff.field.field import TriplaneField
 from nerfdiff.field.interpolation import Interpolate
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.render import renderer as renderer_module
-from nerfdiff.render.renderer import Renderer
+from nerfdiff.render.renderer import Renderer, Rendering
 
 NEAR, FAR = 0.8, 1.8
 
@@ -55,6 +55,10 @@ def gradients(values: list[torch.Tensor], of: TriplaneField) -> list[torch.Tenso
     return torch.autograd.grad(total, [of.triplane.planes, *of.decoder.parameters()])
 
 
+def shown(rendering: Rendering) -> list[torch.Tensor]:
+    return [rendering.rgb, rendering.opacity, rendering.depth]
+
+
 def assert_same(values, expected, tolerance=2e-5):
     for value, reference in zip(values, expected, strict=True):
         scale = max(1.0, float(reference.detach().abs().max()))
@@ -86,8 +90,8 @@ def test_renderings_and_gradients_are_those_of_the_plain_field(batch, n, chunk, 
     # importance samples are left out: where they fall is rounded differently in float64
     render = Renderer(12, 0, background, chunk).render
     assert suits(fast, bundle) and not suits(plain, double)
-    values = list(vars(render(fast, bundle, jitter)).values())
-    expected = list(vars(render(plain, double, jitter.double())).values())
+    values = shown(render(fast, bundle, jitter))
+    expected = shown(render(plain, double, jitter.double()))
     assert_same(values, expected)
     assert_same(gradients(values[:2], fast), gradients(expected[:2], plain), 1e-4)
 
@@ -97,7 +101,23 @@ def test_importance_samples_as_well():
     render = Renderer(8, 8, 1.0, 10**6).render
     with torch.no_grad():
         expected = render(fast.__call__, bundle)  # any other function is rendered as it is
-        assert_same(list(vars(render(fast, bundle)).values()), [v.double() for v in vars(expected).values()], 1e-4)
+        assert_same(shown(render(fast, bundle)), [value.double() for value in shown(expected)], 1e-4)
+
+
+@pytest.mark.parametrize("chunk", [10**6, 300])
+def test_samples_drawn_from_kept_weights_as_well(chunk, monkeypatch):
+    monkeypatch.setattr(renderer_module, "CACHED_POINTS", 200)
+    fast, bundle = field(2, 6, 6), rays(2, 50)
+    render = Renderer(8, 8, 1.0, chunk).render
+    with torch.no_grad():
+        before = render(fast, bundle, keep_coarse=True)
+        assert torch.equal(before.rgb, render(fast, bundle).rgb)
+        kept = render(fast.__call__, bundle, keep_coarse=True).coarse
+        torch.testing.assert_close(before.coarse, kept, atol=1e-3, rtol=0)
+    jitter = torch.rand(2, 50, 16, generator=torch.Generator().manual_seed(4))
+    values, expected = (shown(render(own, bundle, jitter, before.coarse)) for own in (fast, fast.__call__))
+    assert_same(values, [value.double() for value in expected], 1e-4)
+    assert_same(gradients(values[:2], fast), [g.double() for g in gradients(expected[:2], fast)], 1e-4)
 
 
 def test_gradients_to_rays_take_the_plain_way():

@@ -23,13 +23,17 @@ FLOATS = {"image_width", "image_height", "shift", "scale", "background", "floor"
 INTEGERS = {"n", "first", "count", "samples", "drawn", "jitters", "height", "width", "points", "size_class"}
 
 
-def compile_one(kernel, capability: int, planes: str, warps: int, **constants) -> str:
-    """Name and size of the machine code."""
+def compile_one(kernel, capability: int, planes: str, warps: int, weights: str = "*fp32", **constants) -> str:
+    """Name and size of the machine code.
+
+    Args:
+        planes, weights: types of these pointers.
+    """
     signature = {}
     for parameter in kernel.params:
         name = parameter.name
         kind = "constexpr" if parameter.is_constexpr else "fp32" if name in FLOATS else "*fp32"
-        kind = "i32" if name in INTEGERS else planes if name == "planes" else POINTERS.get(name, kind)
+        kind = "i32" if name in INTEGERS else {"planes": planes, "weights": weights, **POINTERS}.get(name, kind)
         signature[name] = kind
     source = ASTSource(fn=kernel, signature=signature, constexprs=constants)
     target = GPUTarget("cuda", capability, 32)
@@ -48,7 +52,8 @@ def compile_all(capability: int = 90, channels: int = 12, hidden: int = 16) -> N
         asked = {"PLANES": how, "DECODER": True, "RAYS": True}
         print(compile_one(gradient_kernel, capability, planes, 4, OPAQUE=opaque, **asked, **common))
     print(compile_one(coarse_kernel, capability, "*bf16", 4, JITTER=True, PRECISION="bf16", **field))
-    print(compile_one(merge_kernel, capability, "", 4, JITTER=True, DP=64, R=16))
+    for weights, even in (("*fp32", False), ("*fp16", True)):
+        print(compile_one(merge_kernel, capability, "", 4, weights, JITTER=True, EVEN=even, DP=64, R=16))
     print(compile_one(cells_kernel, capability, "", 1, C=channels, CP=padded["CP"], P=16))
 
 

@@ -14,11 +14,12 @@ from nerfdiff.errors import ConfigError
 from nerfdiff.render import backend
 from nerfdiff.render.kernels import function, tuning
 from nerfdiff.render.renderer import Renderer
+from nerfdiff.render.sampling import KEPT
 
 
 @pytest.fixture(autouse=True)
 def _nothing_told_yet(monkeypatch, caplog):
-    for name, value in (("_told", set()), ("_failures", {})):
+    for name, value in (("_told", set()), ("_failures", {}), ("_trusted", set())):
         monkeypatch.setattr(backend, name, value)
     without_trials(monkeypatch)
     backend._missing.cache_clear()
@@ -61,6 +62,17 @@ def test_the_kernels_render_when_asked(caplog):
     assert not caplog.records
 
 
+def test_coarse_weights_are_kept_and_given_back(caplog):
+    scene, other = Scene(), Scene(shift=1.0)
+    kept, expected = (
+        r.render(other.field, scene.rays, keep_coarse=True).coarse for r in (scene.triton, scene.reference)
+    )
+    torch.testing.assert_close(kept, expected, atol=1e-3, rtol=0)
+    found, expected = (r.render(scene.field, scene.rays, scene.jitter, kept) for r in (scene.triton, scene.reference))
+    torch.testing.assert_close(found.rgb, expected.rgb, atol=1e-4, rtol=0)
+    assert found.rgb.grad_fn.name().startswith("FusedRender") and not caplog.records
+
+
 def test_auto_takes_kernels_on_a_gpu_only(caplog):
     scene = Scene()
     assert scene.reference.backend == "torch" and Renderer(1, 1, 1.0, 1).backend == "auto"
@@ -69,10 +81,57 @@ def test_auto_takes_kernels_on_a_gpu_only(caplog):
     assert not caplog.records
 
 
-@pytest.mark.parametrize("wrong", [{"backend": "cuda"}, {"precision": "fp8"}])
+@pytest.mark.parametrize("wrong", [{"backend": "cuda"}, {"kernel_precision": "fp8"}])
 def test_unknown_choices_are_errors(wrong):
     with pytest.raises(ConfigError, match="choose auto"):
         Renderer(1, 1, 1.0, 1, **wrong)
+
+
+@pytest.mark.parametrize("gradients", [False, True])
+def test_kernels_are_compared_with_the_reference_before_they_are_trusted(gradients, monkeypatch, caplog):
+    monkeypatch.setattr(backend, "_COMPARED", (DEVICE.type,))
+    looked = []
+    real = backend.disagreement
+    monkeypatch.setattr(backend, "disagreement", lambda *given: looked.append(given) or real(*given))
+    scene = Scene()
+    for _ in range(2):
+        with torch.set_grad_enabled(gradients):
+            found = scene.triton.render(scene.field, scene.rays, scene.jitter)
+    assert len(looked) == 1 and looked[0][-1] is gradients and not caplog.records
+    assert (found.rgb.cpu() - scene.case.reference()[0][0]).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_rounding_is_no_disagreement(dtype, monkeypatch, caplog):
+    monkeypatch.setattr(backend, "_COMPARED", (DEVICE.type,))
+    scene = Scene(channels=16, hidden=16, plane=(8, 8), scenes=2)
+    with torch.autocast(DEVICE.type, torch.bfloat16, enabled=dtype == torch.bfloat16):
+        scene.triton.render(scene.field, scene.rays, scene.jitter)
+    assert len(backend._trusted) == 1 and not caplog.records
+
+
+def wrong_colours(values):
+    return (values[0] + 0.1, *values[1:])
+
+
+def wrong_gradients(values):
+    rgb = values[0]
+    return (rgb.detach() + 1.5 * (rgb - rgb.detach()), *values[1:])
+
+
+def no_numbers(values):
+    return (values[0] * torch.nan, *values[1:])
+
+
+@pytest.mark.parametrize(
+    ("break_it", "why"),
+    [(wrong_colours, "colours differ"), (wrong_gradients, "gradients differ"), (no_numbers, "colours differ")],
+)
+def test_kernels_that_show_something_else_are_not_used(break_it, why, monkeypatch, caplog):
+    monkeypatch.setattr(backend, "_COMPARED", (DEVICE.type,))
+    real = backend._render
+    monkeypatch.setattr(backend, "_render", lambda *given: break_it(real(*given)))
+    Scene().taken_over(caplog, why)
 
 
 def test_no_triton(monkeypatch, caplog):
@@ -101,7 +160,7 @@ def test_rays_whose_bounds_are_learned(caplog):
 def test_no_rays():
     scene = Scene()
     none = replace(scene.rays, **{name: getattr(scene.rays, name)[:, :0] for name in vars(scene.rays)})
-    assert "nothing to render" in backend._obstacle(scene.triton, scene.field, none, None)
+    assert "nothing to render" in backend._obstacle(scene.triton, scene.field, none, None, None)
 
 
 def test_old_gpus_and_other_devices(monkeypatch):
@@ -126,7 +185,8 @@ def test_a_kernel_that_fails_is_not_tried_again(monkeypatch, caplog):
     assert len(calls) == 1
 
 
-def test_a_backward_pass_that_fails_is_done_by_the_reference(monkeypatch, caplog):
+@pytest.mark.parametrize("coarse", [None, torch.tensor([[[0.1, 0.8]], [[0.5, 0.0]]], dtype=KEPT, device=DEVICE)])
+def test_a_backward_pass_that_fails_is_done_by_the_reference(coarse, monkeypatch, caplog):
     def fails(*_, **__):
         raise RuntimeError("ptxas")
 
@@ -136,7 +196,7 @@ def test_a_backward_pass_that_fails_is_done_by_the_reference(monkeypatch, caplog
     wanted = [planes, *scene.field.decoder.parameters()]
     colours = scene.case.d_outputs[0].to(DEVICE)
     found, expected = (
-        torch.autograd.grad(renderer.render(scene.field, scene.rays, scene.jitter).rgb, wanted, colours)
+        torch.autograd.grad(renderer.render(scene.field, scene.rays, scene.jitter, coarse).rgb, wanted, colours)
         for renderer in (scene.triton, scene.reference)
     )
     for value, truth in zip(found, expected, strict=True):
@@ -169,6 +229,6 @@ def test_products_are_the_reference_s(monkeypatch):
         assert backend._precision(renderer, gpu) == "tf32"
     finally:
         torch.backends.cuda.matmul.fp32_precision = before
-    assert backend._precision(replace(renderer, precision="ieee"), gpu) == "ieee"
+    assert backend._precision(replace(renderer, kernel_precision="ieee"), gpu) == "ieee"
     monkeypatch.setattr(tuning, "INTERPRETED", True)
-    assert backend._precision(replace(renderer, precision="bf16"), gpu) == "rounded"
+    assert backend._precision(replace(renderer, kernel_precision="bf16"), gpu) == "rounded"

@@ -48,6 +48,7 @@ CASES = {
     "scenes, opaque background, no jitter": Case(scenes=2, background=None, jittered=False, plane=(1, 5)),
     "a decoder for each scene, grey": Case(scenes=2, own_decoders=True, background=0.5, plane=(4, 1)),
     "uniform samples only": Case(uniform=7, importance=0, background=None, n=1),
+    "drawn from coarse weights of before": Case(scenes=2, n=3, uniform=5, importance=4, cached=True),
     "one sample of each kind": Case(uniform=1, importance=1, n=1, background=0.2),
 }
 
@@ -135,8 +136,9 @@ def test_only_what_is_asked_for_is_computed(monkeypatch):
     assert (alone - truth).abs().max() <= 1e-4 * truth.abs().max()
 
 
+@pytest.mark.parametrize("even", [False, True])
 @pytest.mark.parametrize("jittered", [True, False])
-def test_where_to_look_next_is_the_reference_s_choice(jittered):
+def test_where_to_look_next_is_the_reference_s_choice(jittered, even):
     g = torch.Generator().manual_seed(4)
     case = Case(n=6, uniform=9, importance=7, jittered=jittered)
     weights = torch.rand(1, 6, 9, generator=g).pow(8)
@@ -145,10 +147,12 @@ def test_where_to_look_next_is_the_reference_s_choice(jittered):
     weights[0, 1, 4] = 1  # everything in one bin
     uniform, drawn = (None, None) if case.jitter is None else case.jitter.double().split([9, 7], -1)
     near, far = case.ray_near.double(), case.ray_far.double()
-    first = in_bins(uniform_edges(near, far, 9), uniform)
-    second = importance_distances(edges_between(first, near, far), weights.double(), 7, drawn)
+    edges = uniform_edges(near, far, 9)
+    first = in_bins(edges, uniform)
+    bins = edges if even else edges_between(first, near, far)
+    second = importance_distances(bins, weights.double(), 7, drawn)
     expected = torch.cat([first, second], -1).sort(-1).values
-    found = passes.merged_distances(case.settings(), bundle(case), weights.to(DEVICE), 0)
+    found = passes.merged_distances(case.settings(), bundle(case), weights.to(DEVICE), 0, even)
     assert (found.cpu() - expected).abs().max() < 2e-5
 
 
@@ -163,6 +167,27 @@ def test_the_first_look_sees_the_reference_s_weights():
     expected = compositing_weights(density.reshape(distances.shape), lengths)[:, 1:4]
     found = passes.coarse_weights(case.settings(), fields(case), bundle(case), 1, 3)
     assert (found.cpu() - expected).abs().max() < 1e-5
+
+
+def test_weights_are_kept_of_all_rays_as_the_reference_keeps_them():
+    case = Case(scenes=2, n=3, uniform=5, jittered=False)
+    leaves = [leaf.double() for leaf in case.leaves]
+    expected = case.renderer.render(case.field(leaves), case.rays(leaves), keep_coarse=True)
+    rays_at_once = 2 * 2 * (5 + 3)  # 2 of each scene
+    found = case.render([leaf.to(DEVICE) for leaf in case.leaves], case.settings(points=rays_at_once), keep_coarse=True)
+    assert found[3].dtype == expected.coarse.dtype
+    assert (found[3].cpu().double() - expected.coarse.double()).abs().max() < 1e-3
+    assert (found[0].cpu() - expected.rgb).abs().max() < 1e-5
+
+
+def test_given_weights_are_looked_for_neither_forwards_nor_backwards(monkeypatch):
+    def never(*_, **__):
+        raise AssertionError("a coarse pass")
+
+    monkeypatch.setattr(passes, "_coarse", never)
+    compare(Case(n=3, cached=True), points=2 * 6)  # two rays at a time, then one
+    with pytest.raises(AssertionError, match="a coarse pass"):
+        Case(n=1).fused()
 
 
 def fields(case: Case) -> Fields:

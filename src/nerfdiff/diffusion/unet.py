@@ -24,6 +24,9 @@ from nerfdiff.errors import ConfigError
 Context = Sequence[Tensor | KeyValue]
 """What a U-Net attends to, one entry per attention block: a twin's features, or `UNet.keys_values` of them."""
 
+AUTO = "auto"
+"""Value of `checkpointing` for whoever trains to settle."""
+
 
 class Stage(nn.Module):
     """A residual block, then at some resolutions self-attention, then where conditioned cross-attention.
@@ -67,7 +70,8 @@ class UNet(nn.Module):
         cross_attention: attend to the `features` of a U-Net of the same shape after every attention block.
         zero_output: start with zero output (right for a residual target, wrong for features).
         checkpointing: where the image is this many times smaller than the input, or everywhere (true), every stage is
-            recomputed in the backward pass instead of keeping its activations.
+            recomputed in the backward pass instead of keeping its activations. `auto`, which training settles by the
+            memory there is, is everywhere where nobody settled it.
 
     Raises:
         ConfigError: `checkpointing` names a resolution that the U-Net does not have.
@@ -86,7 +90,7 @@ class UNet(nn.Module):
         with_time: bool,
         cross_attention: bool,
         zero_output: bool,
-        checkpointing: bool | Sequence[int],
+        checkpointing: bool | str | Sequence[int],
     ):
         super().__init__()
         self.width = width
@@ -213,21 +217,21 @@ class UNet(nn.Module):
         return down, self.up[(self.levels - 1 - level) * (self.res_blocks + 2) - 1]
 
 
-def levels_to_recompute(checkpointing: bool | Sequence[int], levels: int) -> frozenset[int]:
+def levels_to_recompute(checkpointing: bool | str | Sequence[int], levels: int) -> frozenset[int]:
     """Numbers of the U-Net's resolutions, from 0 for the input's, whose activations are not kept.
 
     Args:
-        checkpointing: of all (true), none (false), or those where the image is this many times smaller.
+        checkpointing: of all (true, auto), none (false), or those where the image is this many times smaller.
 
     Raises:
         ConfigError: there is no such resolution.
     """
-    if isinstance(checkpointing, bool):
+    if isinstance(checkpointing, bool) or checkpointing == AUTO:
         return frozenset(range(levels)) if checkpointing else frozenset()
     known = {2**level: level for level in range(levels)}
-    if not set(checkpointing) <= known.keys():
+    if isinstance(checkpointing, str) or not set(checkpointing) <= known.keys():
         raise ConfigError(
-            f"model.unet.checkpointing={list(checkpointing)} must be true, false, or some of {list(known)}: how many "
+            f"model.unet.checkpointing={checkpointing} must be auto, true, false, or some of {list(known)}: how many "
             "times smaller than the input the images are whose activations are recomputed"
         )
     return frozenset(known[downsampling] for downsampling in checkpointing)

@@ -37,6 +37,8 @@ class Distillation:
         fit_source: whether the input image is fitted beside the virtual views.
         target_tolerance, source_tolerance: dB by which the last targets and the input view may be explained worse
             before a scene falls back to its first field.
+        coarse: where importance samples of the inner steps come from: new coarse weights at `every_step`, or those of
+            the last `refresh`, when the field was rendered for the teacher.
         cuda_graphs: record an inner step once and replay it, on a GPU.
         views_at_once: views denoised in one batch, which bounds memory.
     """
@@ -52,6 +54,7 @@ class Distillation:
     fit_source: bool
     target_tolerance: float
     source_tolerance: float
+    coarse: str
     cuda_graphs: bool
     views_at_once: int
 
@@ -81,7 +84,7 @@ class Distillation:
             callbacks: of the Trainer that fits them.
 
         Raises:
-            ConfigError: scenes that do not fit into one batch.
+            ConfigError: scenes that do not fit into one batch, or a field that is no triplane.
         """
         if len({scene.source.shape for scene in scenes}) > 1:
             raise ConfigError("scenes whose images differ in size cannot be distilled together: set scenes_at_once=1")
@@ -89,12 +92,13 @@ class Distillation:
         with torch.no_grad():
             # One by one, so that a scene's numbers do not depend on its company.
             encodings = [model.encode(s.source, s.source_cameras, s.near, s.far) for s in scenes]
+        triplane = Triplane.join([encoding.triplane for encoding in encodings])
         views = [
             VirtualViews(model, encoding, self.prior(scene), self.views_at_once, own)
             for encoding, scene, own in zip(encodings, scenes, seeds, strict=True)
         ]
         module = NGDModule(
-            RefinedField(Triplane.join([encoding.triplane for encoding in encodings]), model.decoder),
+            RefinedField(triplane, model.decoder),
             views,
             [self.teacher(v) for v in views],
             self.inner_steps,
@@ -105,6 +109,7 @@ class Distillation:
             self.fit_source,
             self.target_tolerance,
             self.source_tolerance,
+            self.coarse,
             self.cuda_graphs,
             seeds,
         )

@@ -18,7 +18,7 @@ from nerfdiff.results.files import atomic
 
 FIELD = "field.safetensors"
 FORMAT = 1
-MACHINES = ("backend", "precision")
+MACHINES = ("backend", "kernel_precision")
 """Settings of the renderer that suit a machine, not a field."""
 
 

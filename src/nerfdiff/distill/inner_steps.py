@@ -27,7 +27,8 @@ class InnerSteps:
     Args:
         field: of one or several scenes; each fits its own part of it, whatever the others do.
         renderer: that shows it.
-        batches: rays and colours.
+        batches: rays and colours; and, where they are remembered, the coarse weights that importance samples are drawn
+            from instead of new ones.
         optimizer: of the field's parameters; `capturable` where steps are to be recorded.
         rays: B, per step and scene.
         generators: one per scene, so that a scene's rays do not depend on its company.
@@ -93,7 +94,7 @@ class InnerSteps:
         """The step whose number is on the device."""
         picked, jitter = (drawn.index_select(1, self._number)[:, 0] for drawn in (self._picked, self._jitter))
         rays, colours = self.batches.at(picked)
-        rgb = self.renderer.render(self.field.field(), rays, jitter).rgb
+        rgb = self.renderer.render(self.field.field(), rays, jitter, self.batches.coarse_at(picked)).rgb
         losses = F.mse_loss(rgb, colours, reduction="none").mean((1, 2))
         self.optimizer.zero_grad()
         losses.sum().backward()  # each scene's gradient is that of its own loss

@@ -44,9 +44,13 @@ class RefinedField(nn.Module):
         """Colour and density of points in the input camera's space."""
         return TriplaneField(self.triplane, self.decoder)
 
-    def render(self, renderer: Renderer, cameras: Cameras) -> Rendering:
-        """Whole images of cameras [scenes, views]: leading shape [scenes, views, height, width]."""
-        return renderer.render_views(self.field(), cameras, self.near, self.far)
+    def render(self, renderer: Renderer, cameras: Cameras, keep_coarse: bool = False) -> Rendering:
+        """Whole images of cameras [scenes, views]: leading shape [scenes, views, height, width].
+
+        Args:
+            keep_coarse: as `Renderer.render`'s.
+        """
+        return renderer.render_views(self.field(), cameras, self.near, self.far, keep_coarse=keep_coarse)
 
     def alone(self, scene: int) -> "RefinedField":
         """One scene's field, copied."""

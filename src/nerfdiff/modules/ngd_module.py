@@ -17,6 +17,7 @@ from nerfdiff.distill.trace import Step
 from nerfdiff.distill.virtual_views import VirtualViews
 from nerfdiff.errors import ConfigError
 from nerfdiff.randomness import generator
+from nerfdiff.results.timing import timed
 
 DECAYS = {
     "none": lambda done: 1.0,
@@ -24,6 +25,9 @@ DECAYS = {
     "cosine": lambda done: 0.5 * (1 + math.cos(math.pi * done)),
 }
 """Factors of the learning rates, by the share of the teacher's steps that are done."""
+
+LOOKS = ("every_step", "refresh")
+"""When coarse weights are found anew."""
 
 SceneImages = Float[Tensor, "scenes views 3 height width"]
 
@@ -45,11 +49,15 @@ class NGDModule(LightningModule):
         fit_source: whether the input image, the one view that is known, is fitted beside the virtual views.
         target_tolerance, source_tolerance: dB by which the last targets and the input view may be explained worse
             before a scene falls back to its first field.
+        coarse: when the weights are found from which importance samples are drawn: at `every_step` of the inner ones,
+            or at each `refresh`, when the field is rendered for the teacher anyway: inner steps then look at all their
+            samples at once. These take 2 bytes for each bin of each ray of all views. Where teachers do not follow the
+            field, nothing is rendered between inner steps, and weights are found at every step.
         cuda_graphs: record an inner step once and replay it, on a GPU.
         seeds: of each scene's rays.
 
     Raises:
-        ConfigError: another `lr_decay`, no rays, negative steps, or scenes with different numbers of views.
+        ConfigError: another `lr_decay` or `coarse`, no rays, negative steps, or scenes with different numbers of views.
     """
 
     def __init__(
@@ -65,6 +73,7 @@ class NGDModule(LightningModule):
         fit_source: bool,
         target_tolerance: float,
         source_tolerance: float,
+        coarse: str,
         cuda_graphs: bool,
         seeds: Sequence[tuple[int | str, ...]],
     ):
@@ -77,6 +86,8 @@ class NGDModule(LightningModule):
             raise ConfigError(f"rays={rays} must be at least 1 and inner_steps={inner_steps} at least 0")
         if lr_decay not in DECAYS:
             raise ConfigError(f"strategy.lr_decay={lr_decay!r}: choose {', '.join(DECAYS)}")
+        if coarse not in LOOKS:
+            raise ConfigError(f"strategy.coarse={coarse!r}: choose {', '.join(LOOKS)}")
         if len({len(v) for v in views}) > 1:
             raise ConfigError(
                 f"scenes with {sorted({len(v) for v in views})} virtual views cannot be distilled together: "
@@ -85,6 +96,7 @@ class NGDModule(LightningModule):
         self.lr_planes, self.lr_decoder, self.lr_decay = lr_planes, lr_decoder, lr_decay
         self.fit_source = fit_source
         self.tolerances = target_tolerance, source_tolerance
+        self.keeps_coarse = coarse == "refresh" and teachers[0].follows_field and inner_steps > 0
         self.cuda_graphs = cuda_graphs
         self.seeds = seeds
         self.statuses = ["ok"] * len(field)
@@ -116,11 +128,11 @@ class NGDModule(LightningModule):
         self._start = self.field.snapshot()
         self._good = self._start
         self._finite = torch.ones(len(self.field), dtype=torch.bool, device=self.device)
-        cameras = self.cameras
+        self._fitted = self.cameras
         if self.fit_source:
-            both = zip(cameras, self.field.cameras, strict=True)
-            cameras = Cameras.stack([Cameras.join([views, source[None]]) for views, source in both])
-        self._batches = RayBatches(cameras, self.field.near, self.field.far)
+            both = zip(self.cameras, self.field.cameras, strict=True)
+            self._fitted = Cameras.stack([Cameras.join([views, source[None]]) for views, source in both])
+        self._batches = RayBatches(self._fitted, self.field.near, self.field.far)
         self._inner = InnerSteps(
             self.field,
             self.views[0].model.renderer,
@@ -132,7 +144,8 @@ class NGDModule(LightningModule):
         )
 
     def training_step(self, step: int, batch_idx: int) -> None:
-        rendered = self._render(self.cameras) if self.teachers[0].follows_field else None
+        with timed("guide"):
+            rendered = self._guidance() if self.teachers[0].follows_field else None
         per_scene = [None] * len(self.teachers) if rendered is None else rendered
         targets = torch.stack([t.targets(step, images) for t, images in zip(self.teachers, per_scene, strict=True)])
         losses = self._fit(targets)
@@ -178,6 +191,7 @@ class NGDModule(LightningModule):
         t, *_, distance = self._records[-1]
         return t, None if distance is None else _psnr(float(distance.mean()))
 
+    @timed("fit")
     def _fit(self, targets: SceneImages) -> Float[Tensor, "steps scenes"]:
         """N inner steps; their losses."""
         if self.inner_steps == 0:
@@ -198,10 +212,19 @@ class NGDModule(LightningModule):
         self._last_targets = torch.where(keep, targets, self._last_targets)
         self._good = choose(self._finite, self.field.snapshot(), self._good)
 
+    def _guidance(self) -> SceneImages:
+        """The virtual views' renderings. Where coarse weights are kept, the input view is looked at too if fitted."""
+        if not self.keeps_coarse:
+            return self._render(self.cameras)
+        return self._render(self._fitted, remember=True)[:, : self.cameras.shape[1]]
+
     @torch.no_grad()
-    def _render(self, cameras: Cameras) -> SceneImages:
+    def _render(self, cameras: Cameras, remember: bool = False) -> SceneImages:
         renderer = self.views[0].model.renderer
-        images = self.field.render(renderer, cameras).rgb.movedim(-1, 2)
+        rendering = self.field.render(renderer, cameras, keep_coarse=remember)
+        if rendering.coarse is not None:
+            self._batches.remember(rendering.coarse)
+        images = rendering.rgb.movedim(-1, 2)
         for views in self.views:
             views.field_queries += renderer.samples_per_ray * images[0, :, 0].numel()
         return images

@@ -13,13 +13,19 @@ from nerfdiff.errors import ConfigError
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.field import FieldFn, TriplaneField
 from nerfdiff.field.triplane import Triplane
+from nerfdiff.render.agreement import disagreement
 
 log = logging.getLogger(__name__)
 
 BACKENDS = ("auto", "torch", "triton")
 PRECISIONS = ("auto", "ieee", "tf32x3", "tf32", "bf16")
 
-Outputs = tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n"], Float[Tensor, "batch n"]]
+Outputs = tuple[
+    Float[Tensor, "batch n 3"],
+    Float[Tensor, "batch n"],
+    Float[Tensor, "batch n"],
+    Float[Tensor, "batch n bins"] | None,
+]
 
 _WIDEST = 64
 """Channels and hidden units for which a program's tiles fit registers and shared memory."""
@@ -28,38 +34,62 @@ _MOST_DRAWN = 1024
 _POINTS_PER_QUERY = 16
 """The kernels keep 8 bytes of a sample where the reference's backward pass keeps 0.8 kB of a point."""
 
+_COMPARED = ("cuda",)
+"""Devices on which kernels are looked at before they are trusted. The interpreter's are tested beforehand."""
+
 _told: set[str] = set()
 _failures: dict[tuple, str] = {}
+_trusted: set[tuple] = set()
 
 
-def check_choice(backend: str, precision: str) -> None:
+def check_choice(backend: str, kernel_precision: str) -> None:
     """Raises ConfigError unless both are known."""
-    for name, choice, choices in (("backend", backend, BACKENDS), ("precision", precision, PRECISIONS)):
+    known = (("backend", backend, BACKENDS), ("kernel_precision", kernel_precision, PRECISIONS))
+    for name, choice, choices in known:
         if choice not in choices:
             raise ConfigError(f"{name}={choice!r}: choose {', '.join(choices)}")
 
 
 @torch.compiler.disable
-def fused(renderer, field: FieldFn, rays: Rays, jitter: Float[Tensor, "batch n samples"] | None) -> Outputs | None:
-    """Colour, opacity and depth by the fused kernels; None where the reference has to render.
+def fused(
+    renderer,
+    field: FieldFn,
+    rays: Rays,
+    jitter: Float[Tensor, "batch n samples"] | None,
+    coarse: Float[Tensor, "batch n bins"] | None = None,
+    keep_coarse: bool = False,
+) -> Outputs | None:
+    """The values of a `Rendering` by the fused kernels; None where the reference has to render.
 
     `auto` takes the kernels for triplane fields on a GPU. Where they were wanted and cannot run, one line says why,
     once for each reason.
     """
-    if renderer.backend == "torch":
+    if not _wanted(renderer, field, rays):
         return None
-    if renderer.backend == "auto" and not (rays.near.is_cuda and isinstance(field, TriplaneField)):
-        return None
-    reason = _obstacle(renderer, field, rays, jitter)
+    reason = _obstacle(renderer, field, rays, jitter, coarse)
     if reason is None:
         try:
-            return _render(renderer, field, rays, jitter)
+            reason = _distrust(renderer, field, rays, jitter)
+            if reason is None:
+                return _render(renderer, field, rays, jitter, coarse, keep_coarse)
         except torch.OutOfMemoryError:
             raise
         except Exception as error:
             reason = _note_failure(_kind(renderer, field), "the forward pass", error, rays.near.device)
     _tell(reason)
     return None
+
+
+def chosen(renderer, field: FieldFn, rays: Rays) -> str:
+    """What renders these rays, `torch` or `triton`; certain once they were rendered, as kernels may not compile."""
+    fits = _wanted(renderer, field, rays) and _obstacle(renderer, field, rays, None, None) is None
+    return "triton" if fits else "torch"
+
+
+def _wanted(renderer, field: FieldFn, rays: Rays) -> bool:
+    if renderer.backend == "auto":
+        return rays.near.is_cuda and isinstance(field, TriplaneField)
+    return renderer.backend == "triton"
 
 
 def _tell(reason: str) -> None:
@@ -101,12 +131,14 @@ def _interpreted() -> bool:
     return INTERPRETED
 
 
-def _obstacle(renderer, field: FieldFn, rays: Rays, jitter: Tensor | None) -> str | None:
+def _obstacle(renderer, field: FieldFn, rays: Rays, jitter: Tensor | None, coarse: Tensor | None) -> str | None:
     """Why the kernels cannot render this as the reference does."""
     if type(field) is not TriplaneField or type(field.decoder) is not Decoder:
         return "the field is not a triplane with this project's decoder"
     return (
-        _missing() or _device_obstacle(field.triplane.planes.device) or _tensor_obstacle(renderer, field, rays, jitter)
+        _missing()
+        or _device_obstacle(field.triplane.planes.device)
+        or _tensor_obstacle(renderer, field, rays, jitter, coarse)
     )
 
 
@@ -121,7 +153,9 @@ def _device_obstacle(device: torch.device) -> str | None:
     return None
 
 
-def _tensor_obstacle(renderer, field: TriplaneField, rays: Rays, jitter: Tensor | None) -> str | None:
+def _tensor_obstacle(
+    renderer, field: TriplaneField, rays: Rays, jitter: Tensor | None, coarse: Tensor | None
+) -> str | None:
     triplane = field.triplane
     planes, parameters = triplane.planes, list(field.decoder.parameters())
     scenes, _, channels, height, width = planes.shape
@@ -129,11 +163,12 @@ def _tensor_obstacle(renderer, field: TriplaneField, rays: Rays, jitter: Tensor 
     fixed = [rays.near, rays.far, triplane.near, triplane.far, triplane.cameras.K]
     fixed += [] if jitter is None else [jitter]
     exact = [rays.origins, rays.directions, *fixed]
-    devices = {t.device for t in (planes, *parameters, *exact)}
+    rough = [planes, *parameters] + ([] if coarse is None else [coarse])
+    devices = {t.device for t in (*rough, *exact)}
     if len(devices) > 1:
         return f"tensors on {', '.join(sorted(map(str, devices)))}"
     halves = (torch.float32, torch.bfloat16, torch.float16)
-    odd = {t.dtype for t in exact} - {torch.float32} | {t.dtype for t in (planes, *parameters)} - set(halves)
+    odd = {t.dtype for t in exact} - {torch.float32} | {t.dtype for t in rough} - set(halves)
     if odd:
         return f"no kernels for {', '.join(sorted(map(str, odd)))}"
     if rays.near.numel() == 0 or renderer.uniform_samples < 1 or renderer.importance_samples < 0:
@@ -156,7 +191,7 @@ def _tensor_obstacle(renderer, field: TriplaneField, rays: Rays, jitter: Tensor 
 
 def _precision(renderer, device: torch.device) -> str:
     """Of products: what the reference's would be computed in."""
-    chosen = renderer.precision
+    chosen = renderer.kernel_precision
     if chosen == "auto":
         chosen = _regime(device)
     return "rounded" if chosen == "bf16" and _interpreted() else chosen
@@ -177,7 +212,30 @@ def _regime(device: torch.device) -> str:
     return "tf32" if (torch.backends.fp32_precision if own == "none" else own) == "tf32" else "tf32x3"
 
 
-def _render(renderer, field: TriplaneField, rays: Rays, jitter: Tensor | None) -> Outputs:
+def _distrust(renderer, field: TriplaneField, rays: Rays, jitter: Tensor | None) -> str | None:
+    """Why kernels of this kind, about to be used for the first time, are not to be: they show something else."""
+    kind, with_gradients = _kind(renderer, field), torch.is_grad_enabled()
+    device = rays.near.device
+    recording = device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+    if device.type not in _COMPARED or recording or {(*kind, True), (*kind, with_gradients)} & _trusted:
+        return None
+    plain = replace(renderer, backend="torch")
+    reason = disagreement(
+        lambda *given: _render(renderer, *given, None, False)[0],
+        lambda *given: plain.render(*given).rgb,
+        field,
+        rays,
+        jitter,
+        with_gradients,
+    )
+    if reason is None:
+        _trusted.add((*kind, with_gradients))
+        return None
+    _failures[kind] = reason
+    return reason
+
+
+def _render(renderer, field: TriplaneField, rays: Rays, jitter, coarse, keep_coarse: bool) -> Outputs:
     from nerfdiff.render.kernels.arguments import Settings
     from nerfdiff.render.kernels.function import fused_render
 
@@ -204,6 +262,7 @@ def _render(renderer, field: TriplaneField, rays: Rays, jitter: Tensor | None) -
     return fused_render(
         settings,
         recover,
+        keep_coarse,
         triplane.planes,
         *(getattr(layer, name) for layer in (decoder.hidden, decoder.output) for name in ("weight", "bias")),
         rays.origins,
@@ -214,6 +273,7 @@ def _render(renderer, field: TriplaneField, rays: Rays, jitter: Tensor | None) -
         rays.near,
         rays.far,
         jitter,
+        coarse,
     )
 
 
@@ -221,7 +281,7 @@ def _reference_gradients(renderer, field, precision, tensors, d_outputs, needed)
     """The reference's gradients of the first 7 tensors, for a picture whose own backward pass failed."""
     leaves = [tensor.detach().requires_grad_() for tensor in tensors[:7]]
     planes, *parameters, origins, directions = leaves
-    _, near, far, ray_near, ray_far, jitter = tensors[7:]
+    _, near, far, ray_near, ray_far, jitter, coarse = tensors[7:]
     decoder = Decoder(**field.decoder.settings)
     for i, layer in enumerate((decoder.hidden, decoder.output)):
         layer.weight, layer.bias = (nn.Parameter(value.detach()) for value in parameters[2 * i : 2 * i + 2])
@@ -229,7 +289,8 @@ def _reference_gradients(renderer, field, precision, tensors, d_outputs, needed)
     half = precision in ("bf16", "rounded")
     with torch.enable_grad(), torch.autocast(planes.device.type, torch.bfloat16, enabled=half):
         again = TriplaneField(Triplane(planes, field.triplane.cameras, near, far), decoder)
-        out = replace(renderer, backend="torch").render(again, Rays(origins, directions, ray_near, ray_far), jitter)
+        rays = Rays(origins, directions, ray_near, ray_far)
+        out = replace(renderer, backend="torch").render(again, rays, jitter, coarse)
     wanted = [leaf for leaf, need in zip(leaves, needed, strict=True) if need]
     found = iter(torch.autograd.grad((out.rgb, out.opacity, out.depth), wanted, d_outputs))
     return [next(found) if need else None for need in needed]

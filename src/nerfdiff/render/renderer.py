@@ -1,5 +1,6 @@
 """The reference volume renderer: plain PyTorch, bounded memory."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -9,13 +10,16 @@ from torch.utils.checkpoint import checkpoint
 
 from nerfdiff.cameras import Cameras, Rays
 from nerfdiff.field import cpu_field
-from nerfdiff.field.field import FieldFn
+from nerfdiff.field.field import FieldFn, PixelField
 from nerfdiff.render.backend import check_choice, fused
 from nerfdiff.render.compositing import compositing_weights
-from nerfdiff.render.sampling import edges_between, importance_distances, in_bins, uniform_edges
+from nerfdiff.render.sampling import KEPT, edges_between, importance_distances, in_bins, uniform_edges
 
 CACHED_POINTS = 2**16
 """Points at once on a CPU, whatever `chunk` allows: more leave its caches, fewer cost more calls (measured)."""
+
+PARTS = ("origins", "directions", "near", "far", "jitter", "coarse")
+"""What belongs to rays, along their axis."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +30,14 @@ class Rendering:
         rgb: colour over the background.
         opacity: accumulated weight in [0, 1].
         depth: expected distance along the ray given that something was hit; `far` where nothing was.
+        coarse: weights of the uniform samples, each in the middle of one of so many equal bins, from which the others
+            were drawn; in half precision, and only where they are to be kept.
     """
 
     rgb: Float[Tensor, "*rays 3"]
     opacity: Float[Tensor, "*rays"]
     depth: Float[Tensor, "*rays"]
+    coarse: Float[Tensor, "*rays bins"] | None = None
 
 
 @dataclass(frozen=True)
@@ -42,16 +49,16 @@ class Renderer:
         background: grey level behind everything (1 is white); None where a scene has no empty background: the
             farthest sample of each ray is then opaque.
         chunk: points whose intermediate values memory holds. Rendering takes them at most at once; under autograd, rays
-            with more points are recomputed chunk by chunk in the backward pass, so what is kept, beside the rays
-            themselves, is O(chunk) whatever the number of samples.
+            with more points are recomputed chunk by chunk in the backward pass, so what is kept, beside what is given
+            of the rays, is O(chunk) whatever the number of samples.
         backend: `torch` is this reference; `triton` renders triplane fields by fused kernels; `auto` takes these on a
             GPU, and on a CPU the field in the form that it computes fastest. Where kernels cannot run, the reference
             does, and a log line says why.
-        precision: of the kernels' products, whose sums are fp32: `ieee` (slow), `tf32x3` (nearly fp32), `tf32`, `bf16`,
-            or `auto` for what the reference's products are computed in.
+        kernel_precision: of the kernels' products, whose sums are fp32: `ieee` (slow), `tf32x3` (nearly fp32), `tf32`,
+            `bf16`, or `auto` for what the reference's products are computed in.
 
     Raises:
-        ConfigError: another `backend` or `precision`.
+        ConfigError: another `backend` or `kernel_precision`.
     """
 
     uniform_samples: int
@@ -59,33 +66,51 @@ class Renderer:
     background: float | None
     chunk: int
     backend: str = "auto"
-    precision: str = "auto"
+    kernel_precision: str = "auto"
 
     def __post_init__(self):
-        check_choice(self.backend, self.precision)
+        check_choice(self.backend, self.kernel_precision)
 
     @property
     def samples_per_ray(self) -> int:
         return self.uniform_samples + self.importance_samples
 
-    def render(self, field: FieldFn, rays: Rays, jitter: Float[Tensor, "batch n samples"] | None = None) -> Rendering:
+    def render(
+        self,
+        field: FieldFn,
+        rays: Rays,
+        jitter: Float[Tensor, "batch n samples"] | None = None,
+        coarse: Float[Tensor, "batch n bins"] | None = None,
+        keep_coarse: bool = False,
+    ) -> Rendering:
         """Render rays of leading shape [batch, n] through a batch of fields.
 
         Args:
             jitter: uniform in [0, 1), last axis `samples_per_ray`; None is deterministic.
+            coarse: `Rendering.coarse` of an earlier rendering of these rays: importance samples are drawn from it
+                instead of from what the uniform samples see now, so that all samples can be looked at together.
+                There are as many of both kinds as without it. No gradient flows into it.
+            keep_coarse: give the rendering its `coarse`, where importance samples are drawn. Samples that are to
+                stand for equal bins take no jitter.
+
+        Raises:
+            ValueError: `coarse` of another shape than [batch, n, uniform_samples], or `keep_coarse` with `coarse` or
+                jitter.
         """
-        values = fused(self, field, rays, jitter)
+        self._check_coarse(rays, jitter, coarse, keep_coarse)
+        values = fused(self, field, rays, jitter, coarse, keep_coarse)
         if values is not None:
             return Rendering(*values)
         per_ray = rays.near.shape[0] * self.samples_per_ray
         recompute = torch.is_grad_enabled() and rays.near.shape[1] > max(1, self.chunk // per_ray)
-        parts = [rays.origins, rays.directions, rays.near, rays.far]
-        if jitter is not None:
-            parts.append(jitter)
+        parts = vars(rays) | {"jitter": jitter, "coarse": coarse}
+        parts = {name: part for name, part in parts.items() if part is not None}
         if self.backend != "auto" or not cpu_field.suits(field, rays):
-            return Rendering(*self._in_chunks(field, parts, recompute))
-        scenes = zip(cpu_field.scene_by_scene(field), *(part.split(1) for part in parts), strict=True)
-        outputs = [self._in_chunks(alone, own, recompute) for alone, *own in scenes]
+            return Rendering(*self._in_chunks(field, parts, keep_coarse, recompute))
+        outputs = [
+            self._in_chunks(alone, own, keep_coarse, recompute)
+            for alone, own in zip(cpu_field.scene_by_scene(field), _split(parts, 1, 0), strict=True)
+        ]
         return Rendering(*(torch.cat(values) for values in zip(*outputs, strict=True)))
 
     def render_views(
@@ -95,8 +120,12 @@ class Renderer:
         near: Float[Tensor, "batch"],
         far: Float[Tensor, "batch"],
         jitter: Float[Tensor, "batch n samples"] | None = None,
+        keep_coarse: bool = False,
     ) -> Rendering:
         """Render whole images of cameras [batch, views], given in the input cameras' space.
+
+        Args:
+            jitter, keep_coarse: as `render`'s.
 
         Returns:
             A rendering of leading shape [batch, views, height, width].
@@ -109,40 +138,63 @@ class Renderer:
             rays.near.expand(shape).flatten(1, 3),
             rays.far.expand(shape).flatten(1, 3),
         )
-        out = self.render(field, flat, jitter)
-        return Rendering(out.rgb.reshape(*shape, 3), out.opacity.reshape(shape), out.depth.reshape(shape))
+        out = self.render(field, flat, jitter, keep_coarse=keep_coarse)
+        coarse = None if out.coarse is None else out.coarse.reshape(*shape, -1)
+        return Rendering(out.rgb.reshape(*shape, 3), out.opacity.reshape(shape), out.depth.reshape(shape), coarse)
 
-    def _in_chunks(self, field, parts, recompute):
+    def _check_coarse(self, rays, jitter, coarse, keep_coarse):
+        if keep_coarse and (coarse is not None or jitter is not None):
+            raise ValueError("coarse weights are kept of what uniform samples see, which are not jittered")
+        expected = (*rays.near.shape, self.uniform_samples)
+        if coarse is not None and coarse.shape != expected:
+            raise ValueError(f"coarse weights of shape {tuple(coarse.shape)}, expected {expected}")
+
+    def _in_chunks(self, field, parts, keep_coarse, recompute):
         """The values of a `Rendering`, of rays split along their second axis."""
-        points = min(self.chunk, CACHED_POINTS) if parts[0].device.type == "cpu" else self.chunk
-        per_chunk = max(1, points // (len(parts[0]) * self.samples_per_ray))
+        near = parts["near"]
+        points = min(self.chunk, CACHED_POINTS) if near.device.type == "cpu" else self.chunk
+        per_chunk = max(1, points // (len(near) * self.samples_per_ray))
         outputs = []
-        for chunk in zip(*(part.split(per_chunk, dim=1) for part in parts), strict=True):
+        for chunk in _split(parts, per_chunk, 1):
+            given = (field, keep_coarse, *(chunk.get(name) for name in PARTS))
             if recompute:
                 # Nothing random happens inside: the jitter is an argument.
-                outputs.append(checkpoint(self._render, field, *chunk, use_reentrant=False, preserve_rng_state=False))
+                outputs.append(checkpoint(self._render, *given, use_reentrant=False, preserve_rng_state=False))
             else:
-                outputs.append(self._render(field, *chunk))
+                outputs.append(self._render(*given))
         return [torch.cat(values, dim=1) for values in zip(*outputs, strict=True)]
 
-    def _render(self, field, origins, directions, near, far, jitter=None):
+    def _render(self, field, keep_coarse, origins, directions, near, far, jitter, coarse):
         rays = Rays(origins, directions, near, far)
         uniform_jitter, importance_jitter = (
             (None, None) if jitter is None else jitter.tensor_split([self.uniform_samples], dim=-1)
         )
         edges = uniform_edges(near, far, self.uniform_samples)
         distances = in_bins(edges, uniform_jitter)
-        rgb, density = self._query(field, rays, distances)
-        if self.importance_samples > 0:
+        kept = ()
+        if self.importance_samples == 0:
+            rgb, density = self._query(field, rays, distances)
+        elif coarse is not None:
+            with torch.no_grad():
+                drawn = importance_distances(edges, coarse, self.importance_samples, importance_jitter)
+            distances = torch.cat([distances, drawn], -1).sort(-1).values
+            rgb, density = self._query(field, rays, distances)
+        else:
+            rgb, density = self._query(field, rays, distances)
             with torch.no_grad():
                 bins = edges_between(distances, near, far)
                 weights = compositing_weights(density, bins.diff(dim=-1))
                 drawn = importance_distances(bins, weights, self.importance_samples, importance_jitter)
+                kept = (weights.to(KEPT),) if keep_coarse else ()
             rgb_drawn, density_drawn = self._query(field, rays, drawn)
             distances, order = torch.cat([distances, drawn], -1).sort(-1)
             rgb = torch.cat([rgb, rgb_drawn], -2).gather(-2, order[..., None].expand(*order.shape, 3))
             density = torch.cat([density, density_drawn], -1).gather(-1, order)
-        lengths = edges_between(distances, near, far).diff(dim=-1)
+        return *self._composite(rays, distances, rgb, density), *kept
+
+    def _composite(self, rays, distances, rgb, density):
+        """Colour, opacity and depth."""
+        lengths = edges_between(distances, rays.near, rays.far).diff(dim=-1)
         weights = compositing_weights(density, lengths)
         if self.background is None:
             weights = torch.cat([weights[..., :-1], 1 - weights[..., :-1].sum(-1, keepdim=True)], -1)
@@ -152,10 +204,20 @@ class Renderer:
             colour = colour + (1 - opacity)[..., None] * self.background
         reached = opacity > 1e-6
         expected = (weights * distances).sum(-1) / opacity.clamp_min(1e-6)
-        return colour, opacity, torch.where(reached, expected, far)
+        return colour, opacity, torch.where(reached, expected, rays.far)
 
     @staticmethod
     def _query(field, rays, distances):
         points = rays.at(distances)
-        rgb, density = field(points.flatten(1, 2))
+        if isinstance(field, PixelField):
+            directions = rays.directions[..., None, :].expand(points.shape)
+            rgb, density = field(points.flatten(1, 2), directions.flatten(1, 2))
+        else:
+            rgb, density = field(points.flatten(1, 2))
         return rgb.reshape(*points.shape), density.reshape(points.shape[:-1])
+
+
+def _split(parts: dict[str, Tensor], size: int, axis: int) -> Iterator[dict[str, Tensor]]:
+    """All parts, so many entries of an axis at a time."""
+    for values in zip(*(part.split(size, axis) for part in parts.values()), strict=True):
+        yield dict(zip(parts, values, strict=True))

@@ -6,6 +6,9 @@ from torch import Tensor
 
 from nerfdiff.precision import at_least_single
 
+KEPT = torch.float16
+"""Of weights that are kept for later: there are many of them, and samples fall where they do by chance anyway."""
+
 
 def uniform_edges(near: Float[Tensor, "*rays"], far: Float[Tensor, "*rays"], n: int) -> Float[Tensor, "*rays {n}+1"]:
     """The n + 1 edges of n equal bins between near and far."""

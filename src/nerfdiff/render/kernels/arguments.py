@@ -95,13 +95,18 @@ class Fields:
 
 @dataclass(frozen=True)
 class Bundle:
-    """Rays [scenes, n] and their jitter as the kernels read them: contiguous, fp32."""
+    """Rays [scenes, n], their jitter and coarse weights as the kernels read them: contiguous, fp32.
+
+    Args:
+        coarse: of equal bins along each ray, fp32 or a half; None where they are yet to be found.
+    """
 
     origins: Float[Tensor, "scenes n 3"]
     directions: Float[Tensor, "scenes n 3"]
     near: Float[Tensor, "scenes n"]
     far: Float[Tensor, "scenes n"]
     jitter: Float[Tensor, "scenes n samples"] | None
+    coarse: Float[Tensor, "scenes n bins"] | None = None
 
     def arguments(self) -> dict:
         """Of every kernel that walks along rays."""

@@ -5,18 +5,8 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
-from nerfdiff.render.kernels.field import (
-    column,
-    dot,
-    features,
-    first_layer,
-    frustum,
-    operand,
-    second_layer,
-    softplus,
-    unit_coordinates,
-)
-from nerfdiff.render.kernels.samples import absorbed, interval, optical_depth, uniform_distance
+from nerfdiff.render.kernels.field import query, scene_field
+from nerfdiff.render.kernels.samples import absorbed, interval, optical_depth, uniform_distance, vector
 
 
 @triton.jit(do_not_specialize=["n", "first", "count", "size_class"])
@@ -29,30 +19,18 @@ def coarse_kernel(
 ):  # fmt: skip
     """Weights [scenes, count, samples] of rays [scenes, first : first + count] of n; R rays per program."""
     scene = tl.program_id(1).to(tl.int64)
-    own = 0 if SHARED else scene
-    start, inverse_extent, fx, cx, fy, cy = frustum(scene, K, scene_near, scene_far, image_width, image_height)
-    hidden_w, hidden_b = first_layer(w1 + own * HIDDEN * C, b1 + own * HIDDEN, C, HIDDEN, CP, HP)
-    output_w, output_b = second_layer(w2 + own * 4 * HIDDEN, b2 + own * 4, HIDDEN, HP)
-    hidden_w, output_w = operand(hidden_w, PRECISION), operand(output_w, PRECISION)
-    channel = tl.arange(0, CP)
-    planes += scene * 3 * height * width * C
+    planes, frame, layers = scene_field(
+        scene, planes, K, scene_near, scene_far, w1, b1, w2, b2, image_width, image_height, height, width,
+        SHARED, PRECISION, C, HIDDEN, CP, HP,
+    )  # fmt: skip
 
     # every quantity of points lives in a column [R · S], every quantity of compositing in a tile [R, S]
     point = tl.arange(0, R * S)
     ray = tl.program_id(0) * R + point // S
     here = ray < count
-    at = (scene * n + first + ray) * 3
-    ox, oy, oz = (
-        tl.load(origins + at, mask=here, other=0.0),
-        tl.load(origins + at + 1, mask=here, other=0.0),
-        tl.load(origins + at + 2, mask=here, other=0.0),
-    )
-    dx, dy, dz = (
-        tl.load(directions + at, mask=here, other=0.0),
-        tl.load(directions + at + 1, mask=here, other=0.0),
-        tl.load(directions + at + 2, mask=here, other=0.0),
-    )
     at = scene * n + first + ray
+    ox, oy, oz = vector(origins, at, here)
+    dx, dy, dz = vector(directions, at, here)
     low = tl.load(near + at, mask=here, other=0.0)
     extent = tl.load(far + at, mask=here, other=0.0) - low
     point_jitter = jitter + at * jitters
@@ -70,11 +48,8 @@ def coarse_kernel(
     for tile in range(0, samples, S):
         i = tile + point % S
         t = uniform_distance(low, extent, i, samples, point_jitter, here & (i < samples), JITTER)
-        u, v, w, valid = unit_coordinates(ox + t * dx, oy + t * dy, oz + t * dz, start, inverse_extent, fx, cx, fy, cy)
-        x = features(planes, u, v, w, height, width, channel, C)
-        pre = dot(operand(x, PRECISION), hidden_w, PRECISION) + hidden_b[None, :]
-        outputs = dot(operand(pre * tl.sigmoid(pre), PRECISION), output_w, PRECISION) + output_b[None, :]
-        density = tl.where(valid, softplus(column(outputs, 3) + shift) * scale * inverse_extent, 0.0)
+        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        _, density, _, _ = query(planes, x, y, z, frame, layers, shift, scale, height, width, C, CP, PRECISION)
 
         i = tile + tl.arange(0, S)[None, :]
         inside = rows & (i < samples)

@@ -5,18 +5,8 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
-from nerfdiff.render.kernels.field import (
-    column,
-    dot,
-    features,
-    first_layer,
-    frustum,
-    operand,
-    second_layer,
-    softplus,
-    unit_coordinates,
-)
-from nerfdiff.render.kernels.samples import absorbed, interval, optical_depth
+from nerfdiff.render.kernels.field import column, query, scene_field
+from nerfdiff.render.kernels.samples import absorbed, around, optical_depth, store_vector, vector
 
 
 @triton.jit(do_not_specialize=["n", "first", "count", "size_class"])
@@ -33,25 +23,18 @@ def composite_kernel(
     OPAQUE: the last sample lets nothing through, in place of a background.
     """
     scene = tl.program_id(1).to(tl.int64)
-    own = 0 if SHARED else scene
-    start, inverse_extent, fx, cx, fy, cy = frustum(scene, K, scene_near, scene_far, image_width, image_height)
-    hidden_w, hidden_b = first_layer(w1 + own * HIDDEN * C, b1 + own * HIDDEN, C, HIDDEN, CP, HP)
-    output_w, output_b = second_layer(w2 + own * 4 * HIDDEN, b2 + own * 4, HIDDEN, HP)
-    hidden_w, output_w = operand(hidden_w, PRECISION), operand(output_w, PRECISION)
-    channel = tl.arange(0, CP)
-    planes += scene * 3 * height * width * C
+    planes, frame, layers = scene_field(
+        scene, planes, K, scene_near, scene_far, w1, b1, w2, b2, image_width, image_height, height, width,
+        SHARED, PRECISION, C, HIDDEN, CP, HP,
+    )  # fmt: skip
 
     # every quantity of points lives in a column [R · S], every quantity of compositing in a tile [R, S]
     point = tl.arange(0, R * S)
     ray = tl.program_id(0) * R + point // S
     here = ray < count
-    at = (scene * n + first + ray) * 3
-    ox = tl.load(origins + at, mask=here, other=0.0)
-    oy = tl.load(origins + at + 1, mask=here, other=0.0)
-    oz = tl.load(origins + at + 2, mask=here, other=0.0)
-    dx = tl.load(directions + at, mask=here, other=0.0)
-    dy = tl.load(directions + at + 1, mask=here, other=0.0)
-    dz = tl.load(directions + at + 2, mask=here, other=0.0)
+    at = scene * n + first + ray
+    ox, oy, oz = vector(origins, at, here)
+    dx, dy, dz = vector(directions, at, here)
     point_distances = distances + (scene * count + ray) * samples
 
     rays = tl.program_id(0) * R + tl.arange(0, R)
@@ -70,19 +53,12 @@ def composite_kernel(
     for tile in range(0, samples, S):
         i = tile + point % S
         t = tl.load(point_distances + i, mask=here & (i < samples), other=0.0)
-        u, v, w, valid = unit_coordinates(ox + t * dx, oy + t * dy, oz + t * dz, start, inverse_extent, fx, cx, fy, cy)
-        x = features(planes, u, v, w, height, width, channel, C)
-        pre = dot(operand(x, PRECISION), hidden_w, PRECISION) + hidden_b[None, :]
-        outputs = dot(operand(pre * tl.sigmoid(pre), PRECISION), output_w, PRECISION) + output_b[None, :]
-        density = tl.where(valid, softplus(column(outputs, 3) + shift) * scale * inverse_extent, 0.0)
+        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        outputs, density, _, _ = query(planes, x, y, z, frame, layers, shift, scale, height, width, C, CP, PRECISION)
 
         i = tile + tl.arange(0, S)[None, :]
-        inside = row[:, None] & (i < samples)
-        before = tl.load(ray_distances + i - 1, mask=inside & (i > 0), other=0.0)
-        centre = tl.load(ray_distances + i, mask=inside, other=0.0)
-        after = tl.load(ray_distances + i + 1, mask=row[:, None] & (i + 1 < samples), other=0.0)
-        length = interval(before, centre, after, ray_near[:, None], ray_far[:, None], i, samples - 1)
-        optical = optical_depth(tl.reshape(density, [R, S]), tl.where(inside, length, 0.0))
+        inside, centre, length = around(ray_distances, i, ray_near, ray_far, row, samples)
+        optical = optical_depth(tl.reshape(density, [R, S]), length)
         until = passed[:, None] + (tl.cumsum(optical, 1) - optical)
         share = absorbed(optical)
         if OPAQUE:
@@ -96,9 +72,7 @@ def composite_kernel(
         blue += tl.sum(weight * tl.reshape(tl.sigmoid(column(outputs, 2)), [R, S]), 1)
 
     behind = 0.0 if OPAQUE else (1.0 - total) * background
-    tl.store(rgb + at * 3, red + behind, mask=row)
-    tl.store(rgb + at * 3 + 1, green + behind, mask=row)
-    tl.store(rgb + at * 3 + 2, blue + behind, mask=row)
+    store_vector(rgb, at, red + behind, green + behind, blue + behind, row)
     tl.store(opacity + at, total, mask=row)
     reached = total > 1e-6
     tl.store(depth + at, tl.where(reached, reach / tl.where(reached, total, 1.0), ray_far), mask=row)

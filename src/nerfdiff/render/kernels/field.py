@@ -152,3 +152,44 @@ def softplus(x):
     one_more = 1.0 + e
     tiny = one_more == 1.0
     return tl.maximum(x, 0.0) + tl.where(tiny, e, tl.log(one_more) * (e / tl.where(tiny, 1.0, one_more - 1.0)))
+
+
+@triton.jit
+@no_type_check
+def scene_field(
+    scene, planes, K, near, far, w1, b1, w2, b2, image_width, image_height, height, width,
+    SHARED: tl.constexpr, PRECISION: tl.constexpr, C: tl.constexpr, HIDDEN: tl.constexpr, CP: tl.constexpr,
+    HP: tl.constexpr,
+):  # fmt: skip
+    """What a program reads of a scene's field before its first point: planes, `frustum`, and layers as operands."""
+    own = 0 if SHARED else scene
+    hidden_w, hidden_b = first_layer(w1 + own * HIDDEN * C, b1 + own * HIDDEN, C, HIDDEN, CP, HP)
+    output_w, output_b = second_layer(w2 + own * 4 * HIDDEN, b2 + own * 4, HIDDEN, HP)
+    layers = operand(hidden_w, PRECISION), hidden_b, operand(output_w, PRECISION), output_b
+    frame = frustum(scene, K, near, far, image_width, image_height)
+    return planes + scene * 3 * height * width * C, frame, layers
+
+
+@triton.jit
+@no_type_check
+def query(
+    planes, x, y, z, frame, layers, shift, scale, height, width, C: tl.constexpr, CP: tl.constexpr,
+    PRECISION: tl.constexpr,
+):  # fmt: skip
+    """f_θ(ξ_W(x)) at points: the output layer's 16 columns and density per scene unit, and how they came about.
+
+    Returns:
+        outputs [points, 16]; density [points]; (u, v, w, valid) of `unit_coordinates`; and
+        (features, hidden layer before its activation, the activation's gate, hidden layer). What a kernel has no use
+        for is not computed: the compiler drops it.
+    """
+    start, inverse_extent, fx, cx, fy, cy = frame
+    hidden_w, hidden_b, output_w, output_b = layers
+    u, v, w, valid = unit_coordinates(x, y, z, start, inverse_extent, fx, cx, fy, cy)
+    found = operand(features(planes, u, v, w, height, width, tl.arange(0, CP), C), PRECISION)
+    pre = dot(found, hidden_w, PRECISION) + hidden_b[None, :]
+    gate = tl.sigmoid(pre)
+    hidden = operand(pre * gate, PRECISION)
+    outputs = dot(hidden, output_w, PRECISION) + output_b[None, :]
+    density = tl.where(valid, softplus(column(outputs, 3) + shift) * scale * inverse_extent, 0.0)
+    return outputs, density, (u, v, w, valid), (found, pre, gate, hidden)

@@ -10,7 +10,12 @@ from torch.autograd.function import once_differentiable
 from nerfdiff.render.kernels.arguments import Bundle, Fields, Settings
 from nerfdiff.render.kernels.passes import Gradients, gradients, render
 
-Outputs = tuple[Float[Tensor, "scenes n 3"], Float[Tensor, "scenes n"], Float[Tensor, "scenes n"]]
+Outputs = tuple[
+    Float[Tensor, "scenes n 3"],
+    Float[Tensor, "scenes n"],
+    Float[Tensor, "scenes n"],
+    Float[Tensor, "scenes n bins"] | None,
+]
 
 
 class FusedRender(torch.autograd.Function):
@@ -20,21 +25,20 @@ class FusedRender(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(
-        ctx, settings, recover, planes, w1, b1, w2, b2, origins, directions, K, scene_near, scene_far, near, far, jitter
-    ):
-        tensors = (planes, w1, b1, w2, b2, origins, directions, K, scene_near, scene_far, near, far, jitter)
-        with torch.cuda.device_of(near):  # kernels start on the current device
-            outputs = render(settings, *_packed(settings, tensors))
+    def forward(ctx, settings, recover, keep_coarse, *tensors):
+        with torch.cuda.device_of(tensors[0]):  # kernels start on the current device
+            *outputs, kept = render(settings, *_packed(settings, tensors), keep_coarse)
         ctx.settings, ctx.recover = settings, recover
         ctx.save_for_backward(*tensors, *outputs)
-        return outputs
+        if kept is not None:
+            ctx.mark_non_differentiable(kept)
+        return *outputs, kept
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *d_outputs):
-        tensors, outputs = ctx.saved_tensors[:13], ctx.saved_tensors[13:]
-        needed = ctx.needs_input_grad[2:9]
+        tensors, outputs, d_outputs = ctx.saved_tensors[:-3], ctx.saved_tensors[-3:], d_outputs[:3]
+        needed = ctx.needs_input_grad[3:10]
         try:
             with torch.cuda.device_of(tensors[0]):
                 found = _gradients(ctx.settings, tensors, outputs, d_outputs, needed)
@@ -42,12 +46,13 @@ class FusedRender(torch.autograd.Function):
             raise
         except Exception as error:
             found = ctx.recover(error, tensors, d_outputs, needed)
-        return None, None, *found, *(None,) * 6
+        return None, None, None, *found, *(None,) * (len(tensors) - len(found))
 
 
 def fused_render(
     settings: Settings,
     recover: Callable,
+    keep_coarse: bool,
     planes: Float[Tensor, "scenes 3 channels height width"],
     w1: Float[Tensor, "*decoders hidden channels"],
     b1: Float[Tensor, "*decoders hidden"],
@@ -61,29 +66,31 @@ def fused_render(
     near: Float[Tensor, "scenes n"],
     far: Float[Tensor, "scenes n"],
     jitter: Float[Tensor, "scenes n samples"] | None,
+    coarse: Float[Tensor, "scenes n bins"] | None,
 ) -> Outputs:
-    """Colour, opacity and depth of rays in the input cameras' space, as `Renderer` defines them.
+    """The values of a `Rendering` of rays in the input cameras' space, as `Renderer` defines them.
 
     Differentiable, once, in planes, decoder (w1, b1, w2, b2), origins and directions; not in what follows them.
 
     Args:
-        recover: called where the backward pass fails, with the error, the 13 tensors, the outputs' gradients and
+        recover: called where the backward pass fails, with the error, the 14 tensors, the outputs' gradients and
             which of the first 7 need one; returns those gradients.
+        keep_coarse, coarse: as of `Renderer.render`.
     """
-    return FusedRender.apply(
-        settings, recover, planes, w1, b1, w2, b2, origins, directions, K, scene_near, scene_far, near, far, jitter
-    )
+    tensors = (planes, w1, b1, w2, b2, origins, directions, K, scene_near, scene_far, near, far, jitter, coarse)
+    return FusedRender.apply(settings, recover, keep_coarse, *tensors)
 
 
 def _packed(settings: Settings, tensors: tuple[Tensor | None, ...]) -> tuple[Fields, Bundle]:
     """As the kernels read them: planes channels last, and everything contiguous."""
-    planes, w1, b1, w2, b2, origins, directions, K, scene_near, scene_far, near, far, jitter = tensors
+    planes, w1, b1, w2, b2, origins, directions, K, scene_near, scene_far, near, far, jitter, coarse = tensors
     stored = torch.bfloat16 if settings.precision == "bf16" else torch.float32
     planes = planes.movedim(2, -1).to(stored, memory_format=torch.contiguous_format).contiguous()
     frustum = (value.float().contiguous() for value in (K, scene_near, scene_far))
     decoder = (value.contiguous() for value in (w1, b1, w2, b2))
     rays = (value.contiguous() for value in (origins, directions, near, far))
-    return Fields(planes, *frustum, *decoder), Bundle(*rays, None if jitter is None else jitter.contiguous())
+    more = (None if value is None else value.contiguous() for value in (jitter, coarse))
+    return Fields(planes, *frustum, *decoder), Bundle(*rays, *more)
 
 
 def _gradients(

@@ -5,19 +5,8 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
-from nerfdiff.render.kernels.field import (
-    column,
-    columns,
-    dot,
-    features,
-    first_layer,
-    frustum,
-    operand,
-    second_layer,
-    softplus,
-    unit_coordinates,
-)
-from nerfdiff.render.kernels.samples import absorbed, interval, optical_depth
+from nerfdiff.render.kernels.field import column, columns, dot, operand, query, scene_field
+from nerfdiff.render.kernels.samples import absorbed, around, optical_depth, store_vector, vector
 from nerfdiff.render.kernels.spread import add_to_planes, note_cells, slopes
 
 
@@ -42,13 +31,13 @@ def gradient_kernel(
     is known from the picture, so that one walk from front to back is enough.
     """
     scene = tl.program_id(1).to(tl.int64)
-    own = 0 if SHARED else scene
-    start, inverse_extent, fx, cx, fy, cy = frustum(scene, K, scene_near, scene_far, image_width, image_height)
-    hidden_w, hidden_b = first_layer(w1 + own * HIDDEN * C, b1 + own * HIDDEN, C, HIDDEN, CP, HP)
-    output_w, output_b = second_layer(w2 + own * 4 * HIDDEN, b2 + own * 4, HIDDEN, HP)
-    hidden_w, output_w = operand(hidden_w, PRECISION), operand(output_w, PRECISION)
+    planes, frame, layers = scene_field(
+        scene, planes, K, scene_near, scene_far, w1, b1, w2, b2, image_width, image_height, height, width,
+        SHARED, PRECISION, C, HIDDEN, CP, HP,
+    )  # fmt: skip
+    _, inverse_extent, fx, _, fy, _ = frame
+    hidden_w, _, output_w, _ = layers
     channel = tl.arange(0, CP)
-    planes += scene * 3 * height * width * C
 
     # products sum over points: sums over points of columns kept in registers would take most of them
     ones = operand(tl.full([16, R * S], 1.0, tl.float32), PRECISION)
@@ -62,13 +51,9 @@ def gradient_kernel(
         # every quantity of points lives in a column [R · S], every quantity of compositing in a tile [R, S]
         ray = block * R + point // S
         here = ray < count
-        at = (scene * n + first + ray) * 3
-        ox = tl.load(origins + at, mask=here, other=0.0)
-        oy = tl.load(origins + at + 1, mask=here, other=0.0)
-        oz = tl.load(origins + at + 2, mask=here, other=0.0)
-        dx = tl.load(directions + at, mask=here, other=0.0)
-        dy = tl.load(directions + at + 1, mask=here, other=0.0)
-        dz = tl.load(directions + at + 2, mask=here, other=0.0)
+        at = scene * n + first + ray
+        ox, oy, oz = vector(origins, at, here)
+        dx, dy, dz = vector(directions, at, here)
         sample = (scene * count + ray) * samples
 
         rays = block * R + tl.arange(0, R)
@@ -77,19 +62,15 @@ def gradient_kernel(
         ray_near = tl.load(near + at, mask=row, other=0.0)
         ray_far = tl.load(far + at, mask=row, other=0.0)
         ray_distances = (distances + (scene * count + rays) * samples)[:, None]
-        g_red = tl.load(d_rgb + at * 3, mask=row, other=0.0)
-        g_green = tl.load(d_rgb + at * 3 + 1, mask=row, other=0.0)
-        g_blue = tl.load(d_rgb + at * 3 + 2, mask=row, other=0.0)
+        g_red, g_green, g_blue = vector(d_rgb, at, row)
         total = tl.load(opacity + at, mask=row, other=0.0)
         reached = total > 1e-6
         expected = tl.load(depth + at, mask=row, other=0.0)
         g_depth = tl.load(d_depth + at, mask=row, other=0.0)
         g_depth = tl.where(reached, g_depth / tl.where(reached, total, 1.0), 0.0)
         g_weight = tl.load(d_opacity + at, mask=row, other=0.0)
-        remaining = g_red * tl.load(rgb + at * 3, mask=row, other=0.0)
-        remaining += g_green * tl.load(rgb + at * 3 + 1, mask=row, other=0.0)
-        remaining += g_blue * tl.load(rgb + at * 3 + 2, mask=row, other=0.0)
-        remaining += g_weight * total
+        seen_red, seen_green, seen_blue = vector(rgb, at, row)
+        remaining = g_red * seen_red + g_green * seen_green + g_blue * seen_blue + g_weight * total
         if not OPAQUE:
             g_behind = (g_red + g_green + g_blue) * background
             remaining -= g_behind
@@ -110,27 +91,18 @@ def gradient_kernel(
             kept = here & (i < samples)
             t = tl.load(distances + sample + i, mask=kept, other=0.0)
             px, py, pz = ox + t * dx, oy + t * dy, oz + t * dz
-            u, v, w, valid = unit_coordinates(px, py, pz, start, inverse_extent, fx, cx, fy, cy)
-            x = features(planes, u, v, w, height, width, channel, C)
-            x = operand(x, PRECISION)
-            pre = dot(x, hidden_w, PRECISION) + hidden_b[None, :]
-            gate = tl.sigmoid(pre)
-            hidden = operand(pre * gate, PRECISION)
-            outputs = dot(hidden, output_w, PRECISION) + output_b[None, :]
-            raw = column(outputs, 3) + shift
-            density = tl.where(valid, softplus(raw) * scale * inverse_extent, 0.0)
-            slope = tl.where(valid, tl.sigmoid(raw) * scale * inverse_extent, 0.0)
+            outputs, density, place, inner = query(
+                planes, px, py, pz, frame, layers, shift, scale, height, width, C, CP, PRECISION
+            )
+            u, v, w, valid = place
+            x, pre, gate, hidden = inner
+            slope = tl.where(valid, tl.sigmoid(column(outputs, 3) + shift) * scale * inverse_extent, 0.0)
             red = tl.sigmoid(column(outputs, 0))
             green = tl.sigmoid(column(outputs, 1))
             blue = tl.sigmoid(column(outputs, 2))
 
             s = tile + tl.arange(0, S)[None, :]
-            inside = row[:, None] & (s < samples)
-            before = tl.load(ray_distances + s - 1, mask=inside & (s > 0), other=0.0)
-            centre = tl.load(ray_distances + s, mask=inside, other=0.0)
-            after = tl.load(ray_distances + s + 1, mask=row[:, None] & (s + 1 < samples), other=0.0)
-            length = interval(before, centre, after, ray_near[:, None], ray_far[:, None], s, samples - 1)
-            length = tl.where(inside, length, 0.0)
+            inside, centre, length = around(ray_distances, s, ray_near, ray_far, row, samples)
             optical = optical_depth(tl.reshape(density, [R, S]), length)
             seen = tl.exp(-(passed[:, None] + (tl.cumsum(optical, 1) - optical)))
             weight = tl.where(inside, seen * absorbed(optical), 0.0)
@@ -195,12 +167,8 @@ def gradient_kernel(
                 g_dz += tl.sum(tl.reshape(g_z * t, [R, S]), 1)
 
         if RAYS:
-            tl.store(d_origins + at * 3, g_ox, mask=row)
-            tl.store(d_origins + at * 3 + 1, g_oy, mask=row)
-            tl.store(d_origins + at * 3 + 2, g_oz, mask=row)
-            tl.store(d_directions + at * 3, g_dx, mask=row)
-            tl.store(d_directions + at * 3 + 1, g_dy, mask=row)
-            tl.store(d_directions + at * 3 + 2, g_dz, mask=row)
+            store_vector(d_origins, at, g_ox, g_oy, g_oz, row)
+            store_vector(d_directions, at, g_dx, g_dy, g_dz, row)
 
     if DECODER:
         out = d_decoder + (scene * tl.num_programs(0) + tl.program_id(0)) * (HIDDEN * C + 5 * HIDDEN + 4)

@@ -12,11 +12,12 @@ from nerfdiff.render.kernels.samples import uniform_distance
 @no_type_check
 def merge_kernel(
     weights, near, far, jitter, distances, n, first, count, samples, drawn, jitters, floor,
-    JITTER: tl.constexpr, DP: tl.constexpr, R: tl.constexpr,
+    JITTER: tl.constexpr, EVEN: tl.constexpr, DP: tl.constexpr, R: tl.constexpr,
 ):  # fmt: skip
     """Ascending distances [scenes, count, samples + drawn] from weights [scenes, count, samples].
 
-    As `importance_distances` over `edges_between` of the uniform samples. DP pads `drawn`.
+    As `importance_distances` over `edges_between` of the uniform samples; EVEN: over equal bins, of which the weights
+    were found without jitter. DP pads `drawn`.
     """
     scene = tl.program_id(1).to(tl.int64)
     ray = tl.program_id(0) * R + tl.arange(0, R)
@@ -30,7 +31,7 @@ def merge_kernel(
 
     total = tl.zeros([R], tl.float32)
     for i in range(0, samples):
-        total += tl.load(found + i, mask=here, other=0.0)
+        total += tl.load(found + i, mask=here, other=0.0).to(tl.float32)
     hit = total > 1e-8
     inverse = 1.0 / tl.where(hit, total, 1.0)
     even = 1.0 / samples
@@ -51,8 +52,9 @@ def merge_kernel(
     centre = uniform_distance(low, extent, 0, samples, ray_jitter, here, JITTER)
     for i in range(0, samples):
         after = uniform_distance(low, extent, i + 1, samples, ray_jitter, here & (i + 1 < samples), JITTER)
-        next_edge = tl.where(i == samples - 1, end, 0.5 * (centre + after))
-        share = tl.where(hit, tl.load(found + i, mask=here, other=0.0) * inverse, even)
+        next_edge = low + extent * ((i + 1) * even) if EVEN else 0.5 * (centre + after)
+        next_edge = tl.where(i == samples - 1, end, next_edge)
+        share = tl.where(hit, tl.load(found + i, mask=here, other=0.0).to(tl.float32) * inverse, even)
         share = (1.0 - floor) * share + floor * even
         above = below + share
         inside = (quantile >= below[:, None]) & ((quantile < above[:, None]) | (i == samples - 1))

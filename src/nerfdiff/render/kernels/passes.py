@@ -14,7 +14,7 @@ from nerfdiff.render.kernels.composite import composite_kernel
 from nerfdiff.render.kernels.gradient import gradient_kernel
 from nerfdiff.render.kernels.merge import merge_kernel
 from nerfdiff.render.kernels.tuning import Launch, programs_per_scene, size_class
-from nerfdiff.render.sampling import in_bins, uniform_edges
+from nerfdiff.render.sampling import KEPT, in_bins, uniform_edges
 
 _coarse = Launch(coarse_kernel, [(4, 16, 4), (8, 8, 4), (8, 16, 8), (2, 32, 4)], (4, 8))
 _composite = Launch(composite_kernel, [(4, 16, 4), (8, 8, 4), (8, 16, 8), (2, 32, 4)], (4, 8))
@@ -42,9 +42,19 @@ def coarse_weights(
 
 
 def merged_distances(
-    settings: Settings, bundle: Bundle, weights: Float[Tensor, "scenes count bins"], first: int, floor: float = 1e-2
+    settings: Settings,
+    bundle: Bundle,
+    weights: Float[Tensor, "scenes count bins"],
+    first: int,
+    even: bool = False,
+    floor: float = 1e-2,
 ) -> Float[Tensor, "scenes count samples"]:
-    """Uniform and importance samples of rays first … first + count of each scene, in ascending order."""
+    """Uniform and importance samples of rays first … first + count of each scene, in ascending order.
+
+    Args:
+        even: whether the weights are of equal bins, rather than of intervals around this bundle's uniform samples.
+        floor: as of `importance_distances`.
+    """
     scenes, count, bins = weights.shape
     drawn = settings.importance_samples
     distances = torch.empty(scenes, count, bins + drawn, device=weights.device)
@@ -62,6 +72,7 @@ def merged_distances(
         samples=bins,
         drawn=drawn,
         floor=floor,
+        EVEN=even,
         DP=padded,
         R=rays,
     )
@@ -69,21 +80,43 @@ def merged_distances(
 
 
 def distances_along(
-    settings: Settings, fields: Fields, bundle: Bundle, first: int, count: int
+    settings: Settings,
+    fields: Fields,
+    bundle: Bundle,
+    first: int,
+    count: int,
+    kept: Float[Tensor, "scenes n bins"] | None = None,
 ) -> Float[Tensor, "scenes {count} samples"]:
-    """Where rays first … first + count of each scene are sampled."""
-    if settings.importance_samples > 0:
-        return merged_distances(settings, bundle, coarse_weights(settings, fields, bundle, first, count), first)
+    """Where rays first … first + count of each scene are sampled.
+
+    Args:
+        kept: of all rays; the weights that are found of these are written into it.
+    """
     rays = slice(first, first + count)
-    edges = uniform_edges(bundle.near[:, rays], bundle.far[:, rays], settings.uniform_samples)
-    return in_bins(edges, None if bundle.jitter is None else bundle.jitter[:, rays]).contiguous()
+    if settings.importance_samples == 0:
+        edges = uniform_edges(bundle.near[:, rays], bundle.far[:, rays], settings.uniform_samples)
+        return in_bins(edges, None if bundle.jitter is None else bundle.jitter[:, rays]).contiguous()
+    if bundle.coarse is not None:
+        return merged_distances(settings, bundle, bundle.coarse[:, rays].contiguous(), first, even=True)
+    weights = coarse_weights(settings, fields, bundle, first, count)
+    if kept is not None:
+        kept[:, rays] = weights
+    return merged_distances(settings, bundle, weights, first)
 
 
 def render(
-    settings: Settings, fields: Fields, bundle: Bundle
-) -> tuple[Float[Tensor, "scenes n 3"], Float[Tensor, "scenes n"], Float[Tensor, "scenes n"]]:
-    """Colour, opacity and depth."""
+    settings: Settings, fields: Fields, bundle: Bundle, keep_coarse: bool = False
+) -> tuple[
+    Float[Tensor, "scenes n 3"],
+    Float[Tensor, "scenes n"],
+    Float[Tensor, "scenes n"],
+    Float[Tensor, "scenes n bins"] | None,
+]:
+    """Colour, opacity and depth; and, where asked for, the uniform samples' weights that samples were drawn from."""
     rgb, opacity, depth = (torch.empty_like(like) for like in (bundle.origins, bundle.near, bundle.near))
+    kept = None
+    if keep_coarse and settings.importance_samples > 0:
+        kept = torch.empty(*bundle.near.shape, settings.uniform_samples, dtype=KEPT, device=rgb.device)
     for first, count in bundle.chunks(settings.points, settings.samples):
         _composite(
             lambda constants, count=count: (triton.cdiv(count, constants["R"]), len(fields.planes)),
@@ -91,13 +124,13 @@ def render(
             **fields.arguments(settings),
             **bundle.arguments(),
             **_background(settings),
-            distances=distances_along(settings, fields, bundle, first, count),
+            distances=distances_along(settings, fields, bundle, first, count, kept),
             rgb=rgb,
             opacity=opacity,
             depth=depth,
             **_part(len(fields.planes), first, count, settings.samples),
         )
-    return rgb, opacity, depth
+    return rgb, opacity, depth, kept
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from nerfdiff.errors import CheckpointError, ConfigError
+from nerfdiff.field.kinds import TRIPLANE
 from nerfdiff.model import NerfDiff
 from nerfdiff.results.files import atomic, write_text
 
@@ -31,6 +32,7 @@ class LoadedModel:
         weights: `ema` or `raw`.
         config: arguments of `NerfDiff`.
         image_size: (height, width) of the images it was trained on, if known.
+        stability: of its training, under the names of `ResultRow`, where that was recorded.
     """
 
     model: NerfDiff
@@ -38,6 +40,7 @@ class LoadedModel:
     weights: str
     config: Mapping
     image_size: list[int] | None
+    stability: Mapping[str, float | int | None]
 
 
 def load_model(ckpt: str | Path, weights: str, assets: str | Path) -> LoadedModel:
@@ -64,8 +67,8 @@ def load_model(ckpt: str | Path, weights: str, assets: str | Path) -> LoadedMode
             f"{', '.join(map(str, candidates))}. Shipped models: {', '.join(shipped) or 'none'}"
         )
     read = _read_export if path.suffix == ".safetensors" else _read_ckpt
-    config, image_size, state = read(path, weights)
-    return LoadedModel(_build(config, state, path), path, weights, config, image_size)
+    config, image_size, stability, state = read(path, weights)
+    return LoadedModel(_build(config, state, path), path, weights, config, image_size, stability)
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -98,6 +101,7 @@ def export_model(loaded: LoadedModel, folder: str | Path, dtype: torch.dtype) ->
     with atomic(folder / WEIGHTS) as temporary:
         save_file(state, temporary)
     settings = {"weights": loaded.weights, "image_size": loaded.image_size, "model": dict(loaded.config)}
+    settings |= {"stability": dict(loaded.stability)} if loaded.stability else {}
     write_text(folder / CONFIG, yaml.safe_dump(settings, sort_keys=False))
     return folder / WEIGHTS
 
@@ -135,9 +139,12 @@ def check_resumable(path: str | Path, model_config: Mapping, accumulate: int) ->
         CheckpointError: naming every setting that differs.
     """
     checkpoint = read_checkpoint(path)
+    trained = checkpoint["hyper_parameters"]["model"]
+    # before fields had names there was one kind of them
+    trained = trained | {"field": {"name": TRIPLANE} | trained["field"]}
     changed = [
         difference
-        for difference in differences(checkpoint["hyper_parameters"]["model"], model_config, "model.")
+        for difference in differences(trained, model_config, "model.")
         if not difference.startswith(("model.render.chunk:", "model.unet.checkpointing:"))
     ]
     before = checkpoint.get("accumulate_grad_batches", accumulate)
@@ -150,17 +157,21 @@ def check_resumable(path: str | Path, model_config: Mapping, accumulate: int) ->
         )
 
 
-def _read_ckpt(path: Path, weights: str) -> tuple[Mapping, list[int] | None, dict[str, torch.Tensor]]:
+Read = tuple[Mapping, list[int] | None, Mapping[str, float | int | None], dict[str, torch.Tensor]]
+
+
+def _read_ckpt(path: Path, weights: str) -> Read:
     checkpoint = read_checkpoint(path)
     averaged = "current_model_state" in checkpoint
     if weights == "ema" and not averaged:
         raise CheckpointError(f"{path} holds no averaged weights (no EMA callback in that run): use weights=raw")
     state = checkpoint["current_model_state" if weights == "raw" and averaged else "state_dict"]
     state = {name.removeprefix(_PREFIX): value for name, value in state.items() if name.startswith(_PREFIX)}
-    return checkpoint["hyper_parameters"]["model"], checkpoint.get("image_size"), state
+    stability = checkpoint.get("stability", {})
+    return checkpoint["hyper_parameters"]["model"], checkpoint.get("image_size"), stability, state
 
 
-def _read_export(path: Path, weights: str) -> tuple[Mapping, list[int] | None, dict[str, torch.Tensor]]:
+def _read_export(path: Path, weights: str) -> Read:
     try:
         settings = yaml.safe_load(path.with_name(CONFIG).read_text())
         stored, image_size, config = settings["weights"], settings["image_size"], settings["model"]
@@ -174,7 +185,7 @@ def _read_export(path: Path, weights: str) -> tuple[Mapping, list[int] | None, d
         state = load_file(path)
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{path} is not a readable safetensors file ({error})") from error
-    return config, image_size, state
+    return config, image_size, settings.get("stability", {}), state
 
 
 def _build(config: Mapping, state: dict[str, torch.Tensor], path: Path) -> NerfDiff:

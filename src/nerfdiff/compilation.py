@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
+from nerfdiff.diffusion.unet import UNet
 from nerfdiff.errors import ConfigError
 from nerfdiff.model import NerfDiff
 
@@ -52,5 +53,6 @@ def compile_unets(model: NerfDiff, choice: str, cache: str | Path, backend: str 
         unet.compile(backend=backend, dynamic=False)
 
 
-def _unets(model: NerfDiff) -> tuple[nn.Module, nn.Module]:
-    return model.encoder.unet, model.denoiser.unet
+def _unets(model: NerfDiff) -> list[nn.Module]:
+    """Both; of a pixel-aligned NeRF, whose encoder is another, the CDM's."""
+    return [module for module in model.modules() if isinstance(module, UNet)]

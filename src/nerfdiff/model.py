@@ -9,10 +9,13 @@ from torch import Tensor, nn
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.diffusion.denoiser import Condition, Denoiser
-from nerfdiff.field.decoder import Decoder
-from nerfdiff.field.encoder import Encoder, Encoding
-from nerfdiff.field.field import TriplaneField
+from nerfdiff.errors import ConfigError
+from nerfdiff.field.encoder import Encoding
+from nerfdiff.field.field import PixelField, TriplaneField
+from nerfdiff.field.kinds import TRIPLANE, encoder_and_decoder
+from nerfdiff.field.triplane import Triplane
 from nerfdiff.render.renderer import Renderer, Rendering
+from nerfdiff.results.timing import timed
 
 
 class NerfDiff(nn.Module):
@@ -21,9 +24,13 @@ class NerfDiff(nn.Module):
     Args:
         name: of the size, for records.
         unet: sizes shared by the encoder and the CDM ("the image encoder retains the same architecture").
-        field: `channels` of the triplane, and the decoder's `hidden`, `density_shift`, `density_scale`.
+        field: `name` of the single-image NeRF, a triplane where it is not given, and its settings
+            (`encoder_and_decoder`).
         render: the `Renderer`'s settings.
         conditioning: `image`, `ray_maps`, `cross_attention`, `residual_std` of the CDM, and a `name` for records.
+
+    Raises:
+        ConfigError: sizes that cannot be, or a CDM that attends to features which the encoder does not have.
     """
 
     def __init__(self, name: str, unet: Mapping, field: Mapping, render: Mapping, conditioning: Mapping):
@@ -31,12 +38,16 @@ class NerfDiff(nn.Module):
         self.name = name
         field, conditioning = dict(field), dict(conditioning)
         self.conditioning = conditioning.pop("name")
-        channels = field.pop("channels")
-        self.encoder = Encoder(channels, unet)
-        self.decoder = Decoder(channels, **field)
+        self.field_name = field.pop("name", TRIPLANE)
+        if self.field_name != TRIPLANE and conditioning["cross_attention"]:
+            raise ConfigError(
+                f"field={self.field_name} has no U-Net features to attend to: set conditioning.cross_attention=false"
+            )
+        self.encoder, self.decoder = encoder_and_decoder(self.field_name, field, unet)
         self.renderer = Renderer(**render)
         self.denoiser = Denoiser(**conditioning, unet=unet)
 
+    @timed("encode")
     def encode(
         self,
         source: Float[Tensor, "batch 3 height width"],
@@ -44,7 +55,7 @@ class NerfDiff(nn.Module):
         near: Float[Tensor, "batch"],
         far: Float[Tensor, "batch"],
     ) -> Encoding:
-        """Input images in [0, 1] to triplanes and features."""
+        """Input images in [0, 1] to triplanes (or a pixel-aligned NeRF's features) and what the CDM attends to."""
         return self.encoder(source, cameras, near, far)
 
     def settled(self, encoding: Encoding) -> Encoding:
@@ -53,9 +64,10 @@ class NerfDiff(nn.Module):
         keys_values = self.denoiser.unet.keys_values(encoding.context) if self.denoiser.cross_attention else []
         return replace(encoding, context=keys_values)
 
-    def field(self, encoding: Encoding) -> TriplaneField:
+    def field(self, encoding: Encoding) -> TriplaneField | PixelField:
         """The radiance field of each scene."""
-        return TriplaneField(encoding.triplane, self.decoder)
+        make = TriplaneField if isinstance(encoding.features, Triplane) else PixelField.of
+        return make(encoding.features, self.decoder)
 
     def render(
         self,
@@ -64,8 +76,8 @@ class NerfDiff(nn.Module):
         jitter: Float[Tensor, "batch n samples"] | None = None,
     ) -> Rendering:
         """Render views [batch, views] given in the input cameras' space: leading shape [batch, views, h, w]."""
-        triplane = encoding.triplane
-        return self.renderer.render_views(self.field(encoding), cameras, triplane.near, triplane.far, jitter)
+        frustum = encoding.features
+        return self.renderer.render_views(self.field(encoding), cameras, frustum.near, frustum.far, jitter)
 
     def condition(self, encoding: Encoding, cameras: Cameras, rendering: Rendering) -> Condition:
         """What the CDM sees of views [batch, views], flattened into one batch axis of batch · views."""
@@ -74,7 +86,7 @@ class NerfDiff(nn.Module):
             rendered=rendering.rgb.flatten(0, 1).movedim(-1, 1),
             source=encoding.source[:, None].expand(-1, views, -1, -1, -1).flatten(0, 1),
             cameras=cameras.flatten(),
-            near=encoding.triplane.near.repeat_interleave(views),
+            near=encoding.features.near.repeat_interleave(views),
             context=encoding.context,
         )
 

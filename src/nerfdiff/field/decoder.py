@@ -62,10 +62,17 @@ class Decoder(nn.Module):
 
     def activated(self, out: Float[Tensor, "*points 4"]) -> tuple[Float[Tensor, "*points 3"], Float[Tensor, "*points"]]:
         """Colour and density from the output layer's numbers."""
-        out = at_least_single(out)
-        # Softplus: exp overflows in half precision, and a ReLU dies on white backgrounds.
-        density = self.density_scale * F.softplus(out[..., 3] + self.density_shift)
-        return out[..., :3].sigmoid(), density
+        return activated(out, self.density_shift, self.density_scale)
+
+
+def activated(
+    out: Float[Tensor, "*points 4"], density_shift: float, density_scale: float
+) -> tuple[Float[Tensor, "*points 3"], Float[Tensor, "*points"]]:
+    """Colour and density, both fp32, from the four numbers that a network ends in."""
+    out = at_least_single(out)
+    # Softplus: exp overflows in half precision, and a ReLU dies on white backgrounds.
+    density = density_scale * F.softplus(out[..., 3] + density_shift)
+    return out[..., :3].sigmoid(), density
 
 
 def _linear(layer: nn.Linear, x: Float[Tensor, "*points channels"]) -> Float[Tensor, "*points out"]:

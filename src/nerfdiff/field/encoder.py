@@ -1,4 +1,4 @@
-"""The image encoder e_ψ: one image to a camera-aligned triplane, and features for the CDM to attend to."""
+"""The image encoder e_ψ: one image to what a field is made of, and features for the CDM to attend to."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,7 +8,11 @@ from torch import Tensor, nn
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.diffusion.unet import Context, UNet
+from nerfdiff.errors import ConfigError
+from nerfdiff.field.pixel_features import PixelFeatures
+from nerfdiff.field.resnet import ResNetPyramid
 from nerfdiff.field.triplane import Triplane
+from nerfdiff.field.vision_features import VisionFeatures
 
 
 @dataclass(frozen=True)
@@ -17,13 +21,27 @@ class Encoding:
 
     Args:
         source: the input images in [0, 1].
-        triplane: W = e_ψ(I^s).
+        features: W = e_ψ(I^s).
         context: what the CDM attends to: the encoder's features after each attention block, or `NerfDiff.settled`.
     """
 
     source: Float[Tensor, "batch 3 height width"]
-    triplane: Triplane
+    features: Triplane | PixelFeatures
     context: Context
+
+    @property
+    def triplane(self) -> Triplane:
+        """W of a field that can be fitted.
+
+        Raises:
+            ConfigError: W is no triplane.
+        """
+        if isinstance(self.features, Triplane):
+            return self.features
+        raise ConfigError(
+            "this checkpoint's field is a pixel-aligned NeRF, which has no triplane to fit to a scene: it renders with "
+            "strategy=none and conditions strategy=cdm; the others take a checkpoint trained with field=triplane"
+        )
 
 
 class Encoder(nn.Module):
@@ -45,3 +63,30 @@ class Encoder(nn.Module):
         out, features = self.unet(2 * source - 1)
         planes = out.float().unflatten(1, (3, self.channels))
         return Encoding(source, Triplane(planes, cameras, near, far), features)
+
+
+class PixelEncoder(nn.Module):
+    """The image encoders of pixel-aligned NeRFs; the CDM has nothing of theirs to attend to.
+
+    Args:
+        backbone: from images to feature maps.
+        with_image: whether points find the colour of their pixel beside its features, as VisionNeRF's do.
+    """
+
+    def __init__(self, backbone: ResNetPyramid | VisionFeatures, with_image: bool):
+        super().__init__()
+        self.backbone = backbone
+        self.with_image = with_image
+        self.channels = backbone.out_channels + 3 * with_image
+
+    def forward(
+        self,
+        source: Float[Tensor, "batch 3 height width"],
+        cameras: Cameras,
+        near: Float[Tensor, "batch"],
+        far: Float[Tensor, "batch"],
+    ) -> Encoding:
+        """Encode input images in [0, 1] seen by `cameras` [batch]."""
+        image = 2 * source - 1
+        maps = (self.backbone(image).float(), *([image] if self.with_image else []))
+        return Encoding(source, PixelFeatures(maps, cameras, near, far), [])

@@ -1,17 +1,21 @@
 """A radiance field: what the renderer calls at points."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfdiff.field.decoder import Decoder
+from nerfdiff.field.pixel_features import PixelFeatures
+from nerfdiff.field.residual_mlp import ResidualMLP
 from nerfdiff.field.triplane import Triplane
 
 # points [batch, n, 3] -> (colour [batch, n, 3] in [0, 1], density [batch, n] per scene unit)
 FieldFn = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""A `PixelField` stands for one too; the renderer gives it directions beside the points."""
 
 
 @dataclass(frozen=True)
@@ -32,5 +36,53 @@ class TriplaneField:
         self, density: Float[Tensor, "batch n"], valid: Bool[Tensor, "batch n"]
     ) -> Float[Tensor, "batch n"]:
         """The decoder's density, which is per unit of the frustum's depth; 0 where the features are not valid."""
-        depth = (self.triplane.far - self.triplane.near)[:, None]
-        return torch.where(valid, density / depth, 0.0)
+        return _per_scene_unit(density, valid, self.triplane)
+
+
+@dataclass(frozen=True)
+class PixelField:
+    """f_θ(x, d, W(P(x))) of a pixel-aligned NeRF, whose colour and density also depend on where one looks from.
+
+    Args:
+        features: W, or what the MLP's layers that take W alone have made of it.
+        decoder: f_θ.
+        weights: of these layers, for each of the maps on which they are still to work; None where they have.
+    """
+
+    features: PixelFeatures
+    decoder: ResidualMLP
+    weights: tuple[Tensor | None, ...]
+
+    @staticmethod
+    def of(features: PixelFeatures, decoder: ResidualMLP) -> "PixelField":
+        """A field that renders fast.
+
+        Interpolation is linear, as those layers are: they may as well come first. They do where that leaves no more
+        channels to gather at a point than there were; then they work on pixels, not on points.
+        """
+        weight, _ = decoder.injection()
+        maps, weights = [], []
+        for one, share in zip(features.maps, weight.split([one.shape[1] for one in features.maps], 1), strict=True):
+            first = len(share) <= one.shape[1]
+            maps.append(F.conv2d(one, share[..., None, None]) if first else one)
+            weights.append(None if first else share)
+        return PixelField(replace(features, maps=maps), decoder, tuple(weights))
+
+    def __call__(
+        self, points: Float[Tensor, "batch n 3"], directions: Float[Tensor, "batch n 3"]
+    ) -> tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n"]]:
+        """As a `FieldFn`, given the unit direction of each point's ray in the input camera's space too."""
+        sampled, valid = self.features.sample(points)
+        _, injected = self.decoder.injection()
+        parts = sampled.split([one.shape[1] for one in self.features.maps], -1)
+        for part, weight in zip(parts, self.weights, strict=True):
+            injected = injected + (part if weight is None else F.linear(part, weight))
+        rgb, density = self.decoder.given(self.features.centred(points), directions, injected)
+        return rgb, _per_scene_unit(density, valid, self.features)
+
+
+def _per_scene_unit(
+    density: Float[Tensor, "batch n"], valid: Bool[Tensor, "batch n"], frustum: Triplane | PixelFeatures
+) -> Float[Tensor, "batch n"]:
+    depth = (frustum.far - frustum.near)[:, None]
+    return torch.where(valid, density / depth, 0.0)

@@ -8,7 +8,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerfdiff.cameras import Cameras, along_axes
+from nerfdiff.cameras import Cameras
+from nerfdiff.field.frustum import frustum_coordinates
 from nerfdiff.precision import at_least_single, full_precision
 
 # Which of (x̃, ỹ, z̃) runs along the (width, height) of each plane: W_xy, W_xz, W_yz.
@@ -41,21 +42,8 @@ class Triplane:
     def frustum_coordinates(
         self, points: Float[Tensor, "batch n 3"]
     ) -> tuple[Float[Tensor, "batch n 3"], Bool[Tensor, "batch n"]]:
-        """x̃ = [P(x), 2 (x_z − t_n) / (t_f − t_n) − 1], and whether the point lies beyond the near plane.
-
-        x̃ is in [-1, 1]³ inside the frustum; -1 and 1 are the outer edges of the border pixels. Points before
-        t_n are masked before the division: behind the camera they would project to mirrored features.
-        """
-        near, far = self.near[:, None], self.far[:, None]
-        x, y, z = points.unbind(-1)
-        valid = z >= near
-        before = torch.where(valid, z, 1.0)
-        fx, fy, cx, cy = (self.cameras.K[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        u, v = fx * x / before + cx, fy * y / before + cy
-        projected = [2 * u / self.cameras.width - 1, 2 * v / self.cameras.height - 1]
-        depth = 2 * (z - near) / (far - near) - 1
-        coordinates = [torch.where(valid, coordinate, 0.0) for coordinate in (*projected, depth)]
-        return along_axes(coordinates), valid
+        """See `nerfdiff.field.frustum`."""
+        return frustum_coordinates(points, self.cameras, self.near, self.far)
 
     def sample(
         self, points: Float[Tensor, "batch n 3"]

@@ -49,6 +49,29 @@ class Bootstrap:
         low, high = np.quantile(values[drawn].mean(axis=1), [tails, 1 - tails])
         return Estimate(mean, float(low), float(high))
 
+    def over_seeds_and_scenes(self, values: Float[np.ndarray, "metrics seeds scenes"]) -> list[Estimate]:
+        """Per metric the mean over seeds and scenes and its interval: both are drawn, each independently of the other.
+
+        With one seed these are the intervals over the scenes alone.
+        """
+        _, seeds, scenes = values.shape
+        means = values.mean(axis=(1, 2))
+        if seeds * scenes < 2:
+            return [Estimate(float(mean)) for mean in means]
+        rng = np.random.default_rng(self.seed)  # scenes first: the same as in the draws of one seed
+        scene_shares = _shares(rng, self.resamples, scenes)
+        seed_shares = _shares(rng, self.resamples, seeds)
+        drawn = ((seed_shares @ values) * scene_shares).sum(axis=2)
+        tails = (1 - self.level) / 2
+        low, high = np.quantile(drawn, [tails, 1 - tails], axis=1)
+        return [Estimate(*map(float, ends)) for ends in zip(means, low, high, strict=True)]
+
+
+def _shares(rng: np.random.Generator, draws: int, among: int) -> Float[np.ndarray, "draws among"]:
+    """How often each is among as many drawn with replacement, as a share."""
+    drawn = rng.integers(among, size=(draws, among))
+    return (drawn[..., None] == np.arange(among)).mean(axis=1)
+
 
 def spread(values: list[float]) -> Estimate:
     """The mean over runs and their range, where there are several."""

@@ -1,0 +1,138 @@
+"""Everything that the page shows, as JSON."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfdiff.chart.frontier import frontier
+from nerfdiff.chart.labels import labels_of
+from nerfdiff.chart.panels import Panel, panels_of
+from nerfdiff.chart.pictures import links
+from nerfdiff.results.frame import Configuration, Run, newest
+from nerfdiff.results.intervals import Estimate
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Configurations in the page's units, with the frontier of every panel, metric and cost.
+
+    Args:
+        estimates: per configuration, by field.
+        frontiers: numbers of configurations by panel, then metric, then cost.
+    """
+
+    found: Sequence[Configuration]
+    labels: Sequence[dict[str, str]]
+    panels: Sequence[Panel]
+    estimates: Sequence[dict[str, Estimate]]
+    frontiers: Sequence[dict[str, dict[str, list[int]]]] = field(default_factory=list)
+
+    def points(self, panel: Panel, metric: str, cost: str) -> list[int]:
+        """The panel's configurations that have both."""
+        return [n for n in panel.members if metric in self.estimates[n] and cost in self.estimates[n]]
+
+
+def measured(
+    found: Sequence[Configuration], metrics: Sequence[Mapping[str, Any]], costs: Sequence[Mapping[str, Any]]
+) -> Measured:
+    """What there is to show of `metrics` and `costs`, which are those of conf/chart.yaml."""
+    scales = {metric["field"]: 1.0 for metric in metrics} | {cost["field"]: cost["scale"] for cost in costs}
+    estimates = [_scaled(configuration.estimates, scales) for configuration in found]
+    panels = panels_of(found)
+    labels: list[dict[str, str]] = [{} for _ in found]
+    for panel in panels:  # what differs within a panel, not what makes it another
+        for number, told in zip(panel.members, labels_of([found[number] for number in panel.members]), strict=True):
+            labels[number] = told
+    content = Measured(found, labels, panels, estimates)
+    frontiers = [
+        {
+            metric["field"]: {
+                cost["field"]: _frontier(content, panel, metric, cost["field"])
+                for cost in costs
+                if content.points(panel, metric["field"], cost["field"])
+            }
+            for metric in metrics
+        }
+        for panel in panels
+    ]
+    return replace(content, frontiers=frontiers)
+
+
+def _scaled(estimates: Mapping[str, Estimate], scales: Mapping[str, float]) -> dict[str, Estimate]:
+    return {
+        name: Estimate(*(None if value is None else value * scale for value in estimates[name]))
+        for name, scale in scales.items()
+        if name in estimates and math.isfinite(estimates[name].mean)
+    }
+
+
+def _frontier(content: Measured, panel: Panel, metric: Mapping[str, Any], cost: str) -> list[int]:
+    points = content.points(panel, metric["field"], cost)
+    sign = 1 if metric["better"] == "higher" else -1
+    costs = np.array([content.estimates[n][cost].mean for n in points])
+    qualities = np.array([sign * content.estimates[n][metric["field"]].mean for n in points])
+    return [points[index] for index in frontier(costs, qualities)]
+
+
+def configuration_values(content: Measured, number: int, page: Path) -> dict[str, Any]:
+    """A configuration as the page has it; the words of overrides are numbers, see `Words`."""
+    configuration, row = content.found[number], content.found[number].row
+    fell_back = [run.row.error for run in configuration.runs if run.row.fallbacks and run.row.error]
+    return {
+        "labels": content.labels[number],
+        "strategy": row.strategy,
+        "overrides": configuration.settings,
+        "values": {name: _rounded(estimate) for name, estimate in content.estimates[number].items()},
+        "scenes": row.n_scenes,
+        "failed": configuration.failed,
+        "fell_back": "; ".join(dict.fromkeys(fell_back)) or None,
+        "runs": [
+            {"seed": run.row.seed, "command": run.row.command, "time": run.row.time, "id": run.row.run_id}
+            | links(run, page)
+            for run in configuration.runs
+        ],
+    }
+
+
+def failure_values(run: Run) -> dict[str, Any]:
+    """A run that failed as the page has it."""
+    row = run.row
+    return {
+        "status": row.status,
+        "error": row.error,
+        "strategy": row.strategy,
+        "seed": row.seed,
+        "device": run.device,
+        "time": row.time,
+        "overrides": run.settings,
+        "command": row.command,
+    }
+
+
+def failures(runs: Sequence[Run]) -> list[Run]:
+    """Those whose newest attempt failed."""
+    return [run for run in newest(runs) if run.row.status != "ok"]
+
+
+def share_words(entries: Sequence[dict[str, Any]]) -> list[str]:
+    """Replace the overrides of entries by numbers in the list that is returned: thousands of rows repeat them."""
+    numbers: dict[str, int] = {}
+    for entry in entries:
+        entry["overrides"] = [numbers.setdefault(word, len(numbers)) for word in entry["overrides"]]
+    return list(numbers)
+
+
+def to_json(content: Mapping[str, Any]) -> str:
+    """JSON that can stand within a script element."""
+    text = json.dumps(content, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c")  # a tag within a string would end the element
+
+
+def _rounded(estimate: Estimate) -> list[float | None]:
+    values = [None if value is None or not math.isfinite(value) else float(f"{value:.6g}") for value in estimate]
+    return values if values[1] is not None and values[2] is not None else values[:1]

@@ -1,0 +1,229 @@
+"""Result rows as pandas tables: one line per run, or one per configuration with means and intervals."""
+
+import csv
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from nerfdiff.errors import DataError
+from nerfdiff.metrics.summary import IMAGE_METRICS, SCENE_METRICS
+from nerfdiff.results.intervals import Bootstrap, Estimate, spread
+from nerfdiff.results.row import ResultRow, flatten, read_rows
+
+RESULTS = "results.jsonl"
+PER_SCENE = (*IMAGE_METRICS, *SCENE_METRICS)
+PER_RUN = ("fid", "fd_st_vgg")  # one number for all scenes of a run
+TIMINGS = ("scene_s", "distill_s", "denoise_s", "fit_s", "guide_s", "encode_s", "render_s")
+COUNTS = ("denoiser_calls", "field_queries")  # of all scenes of a run; a table has them per scene
+SIZES = ("peak_mem_bytes", "params", "timing_s")
+QUALITIES = (*PER_SCENE, *PER_RUN)
+COSTS = (*TIMINGS, *COUNTS, *SIZES)
+IDENTITY = (
+    "dataset", "split_sha256", "n_scenes", "n_views", "image_size", "ckpt_sha256", "weights", "model", "field",
+    "strategy", "prior", "K", "samples_per_ray", "backend", "compile", "scenes_at_once", "precision", "device", "cpu",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Run:
+    """A row, and the folder of the file that it is from."""
+
+    row: ResultRow
+    home: Path
+
+    @property
+    def folder(self) -> Path | None:
+        """Of its predictions and scores; None where it failed before there was one."""
+        return None if self.row.folder is None else self.home / self.row.folder
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """Its overrides, the seed's left out; in any order they say the same."""
+        return tuple(sorted(word for word in self.row.overrides or () if word.lstrip("+").partition("=")[0] != "seed"))
+
+    @property
+    def device(self) -> str | None:
+        """The accelerator, or the model of the processor that did its work; None where it is not known."""
+        return self.row.cpu or self.row.device if self.row.device == "cpu" else self.row.device
+
+
+def find_results(path: str | Path) -> list[Path]:
+    """The files of results at or below a path, in order.
+
+    Raises:
+        DataError: there is no such file or folder.
+    """
+    path = Path(path)
+    if path.is_file():
+        return [path]
+    if not path.is_dir():
+        raise DataError(f"results={path} does not exist; name a folder of runs or a {RESULTS}")
+    found = []
+    for folder, below, files in os.walk(path):
+        below[:] = sorted(set(below) - {"predictions", "scores"})  # of many files, none of them results
+        found += [Path(folder, RESULTS)] if RESULTS in files else []
+    return found
+
+
+def read_runs(path: Path) -> list[Run]:
+    """The runs of one file of results, oldest first.
+
+    Raises:
+        DataError: see `read_rows`.
+    """
+    return [Run(row, path.parent) for row in read_rows(path)]
+
+
+def newest(runs: Sequence[Run]) -> list[Run]:
+    """The runs, oldest first, without those that were run again.
+
+    One that succeeded gives way to a later one that differs in nothing. One that failed gives way to any later attempt
+    with the same overrides, of which it may have seen too little to know more; but a later failure hides no success.
+    """
+    kept: dict[tuple, Run] = {}
+    for run in runs:
+        attempt = (*_attempt(run), run.row.seed, run.row.overrides is None and run.row.run_id)
+        for device in {run.device, None}:
+            kept.pop((attempt, device), None)
+        succeeded = run.row.status == "ok"
+        key = (_identity(run), run.home, run.row.seed) if succeeded else (attempt, run.device)
+        kept.pop(key, None)
+        kept[key] = run
+    return list(kept.values())
+
+
+def runs_frame(runs: Sequence[Run]) -> pd.DataFrame:
+    """One line per run, all fields of its row flattened, and `results`, the folder of its file."""
+    return pd.DataFrame([{"results": str(run.home)} | flatten(run.row) for run in runs])
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """Runs that agree in everything but their seed, and succeeded.
+
+    Args:
+        failed: how many more of them there are that did not.
+        estimates: of what was measured (`QUALITIES` and `COSTS`), by the names of `ResultRow`. Qualities with values
+            per scene: the mean over seeds and scenes and its bootstrap interval. Other qualities: the mean over
+            seeds and their range. Timings: the mean over seeds of the medians, and the ends of the quartiles around
+            them, of the lowest and the highest seed. Counts (per scene) and sizes: the mean over seeds and their range.
+    """
+
+    runs: tuple[Run, ...]
+    failed: int
+    estimates: dict[str, Estimate]
+
+    @property
+    def row(self) -> ResultRow:
+        """Of its first seed."""
+        return self.runs[0].row
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        return self.runs[0].settings
+
+    @property
+    def seeds(self) -> list[int | None]:
+        return [run.row.seed for run in self.runs]
+
+
+def configurations(runs: Sequence[Run], bootstrap: Bootstrap) -> list[Configuration]:
+    """The configurations of which a run succeeded, in the order of their first such run; see `newest` for what counts.
+
+    Raises:
+        DataError: a file of scores is damaged.
+    """
+    groups: dict[str, list[Run]] = {}
+    failures: dict[tuple, int] = {}
+    for run in newest(runs):
+        if run.row.status == "ok":
+            groups.setdefault(_identity(run), []).append(run)
+        else:
+            failures[_attempt(run)] = failures.get(_attempt(run), 0) + 1
+    return [
+        Configuration(tuple(members), failures.get(_attempt(members[0]), 0), _estimates(members, bootstrap))
+        for members in groups.values()
+    ]
+
+
+def configurations_frame(found: Sequence[Configuration]) -> pd.DataFrame:
+    """One line per configuration: who it is, then `<name>`, `<name>_low` and `<name>_high` of each estimate."""
+    return pd.DataFrame([_line(configuration) for configuration in found])
+
+
+def _line(configuration: Configuration) -> dict[str, object]:
+    row = configuration.row
+    line: dict[str, object] = {name: getattr(row, name) for name in IDENTITY}
+    line["image_size"] = "x".join(map(str, row.image_size or ())) or None
+    line |= {
+        "seeds": " ".join(map(str, configuration.seeds)),
+        "failed": configuration.failed,
+        "fallbacks": sum(run.row.fallbacks or 0 for run in configuration.runs),
+    }
+    for name in (*QUALITIES, *COSTS):
+        if name in configuration.estimates:
+            mean, low, high = configuration.estimates[name]
+            line |= {name: mean, f"{name}_low": low, f"{name}_high": high}
+    return line | {"overrides": " ".join(configuration.settings), "results": str(configuration.runs[0].home)}
+
+
+def _identity(run: Run) -> str:
+    known = [getattr(run.row, name) for name in IDENTITY]
+    return json.dumps([known, run.settings, run.row.overrides is None and run.row.run_id])
+
+
+def _attempt(run: Run) -> tuple:
+    """What is known of a run from its start, however early it failed."""
+    return run.home, run.settings, run.row.strategy
+
+
+def _estimates(runs: Sequence[Run], bootstrap: Bootstrap) -> dict[str, Estimate]:
+    found = {}
+    for name in (*QUALITIES, *COUNTS, *SIZES):
+        values = [value for run in runs if (value := _value(run.row, name)) is not None]
+        if len(values) == len(runs):
+            found[name] = spread(values)
+    for name in TIMINGS:
+        timings = [timing for run in runs if (timing := getattr(run.row, name)) is not None]
+        if len(timings) == len(runs):
+            medians, halves = [t["median"] for t in timings], [t["iqr"] / 2 for t in timings]
+            ends = [(median - half, median + half) for median, half in zip(medians, halves, strict=True)]
+            found[name] = Estimate(
+                float(np.mean(medians)), max(0.0, min(low for low, _ in ends)), max(high for _, high in ends)
+            )
+    names, values = _per_scene(runs)
+    return found | dict(zip(names, bootstrap.over_seeds_and_scenes(values) if names else (), strict=True))
+
+
+def _value(row: ResultRow, name: str) -> float | None:
+    value = getattr(row, name)
+    if value is None or (name in COUNTS and not row.n_scenes):
+        return None
+    return value / row.n_scenes if name in COUNTS else float(value)
+
+
+def _per_scene(runs: Sequence[Run]) -> tuple[list[str], np.ndarray]:
+    """Names of metrics, and their values (metrics, seeds, scenes) where every scene of every run has one."""
+    scores = [dict(_read_scenes(run)) for run in runs]
+    scenes = sorted(set.intersection(*map(set, scores)))
+    names = [name for name in PER_SCENE if scenes and all(name in seed[scene] for seed in scores for scene in scenes)]
+    values = [[[seed[scene][name] for scene in scenes] for seed in scores] for name in names]
+    return names, np.array(values, dtype=np.float64)
+
+
+def _read_scenes(run: Run) -> Iterator[tuple[str, dict[str, float]]]:
+    """What was measured of each scene; nothing where the scores are no longer beside the results."""
+    path = run.folder and run.folder / "scores" / str(run.row.strategy) / "per_scene.csv"
+    if path is None or not path.is_file():
+        return
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            for line in csv.DictReader(file):
+                yield line["scene"], {name: float(line[name]) for name in PER_SCENE if line.get(name)}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path}: cannot be read ({error}); delete it to go without intervals over scenes") from error

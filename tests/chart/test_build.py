@@ -1,0 +1,189 @@
+import csv
+import json
+import re
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from chart_fixtures import FRONTIERS, KNOWN, chart, failed, result, timing, write_results, write_sheet
+from nerfdiff.chart.build import build_chart
+from nerfdiff.cli import load_config
+from nerfdiff.errors import ConfigError, DataError
+
+
+def content(page: Path) -> dict:
+    """What the page knows."""
+    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page.read_text(), re.S)[1])
+
+
+def ids(known: dict, numbers: list[int]) -> list[str]:
+    return [known["configurations"][number]["runs"][0]["id"].rpartition("-")[0] for number in numbers]
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_frontiers_are_the_true_ones(tmp_path):
+    known = content(chart(write_results(tmp_path, *(result(name) for name in KNOWN))))
+    (panel,) = known["panels"]
+    for metric, names in FRONTIERS.items():
+        assert ids(known, panel["frontiers"][metric]["scene_s"]) == names
+    assert ids(known, panel["frontiers"]["psnr"]["params"]) == ["best"]
+    assert "encode_s" not in panel["frontiers"]["psnr"]  # nobody measured it
+
+
+def test_devices_and_test_images_never_share_a_frontier(tmp_path):
+    fast = result("worse", device="Fast GPU", scene_s=timing(0.1))
+    large = result("worse", image_size=[64, 64], scene_s=timing(0.1))
+    other = result("worse", split_sha256="abc", scene_s=timing(0.1))
+    known = content(chart(write_results(tmp_path, *(result(name) for name in KNOWN), fast, large, other)))
+    panels = {(panel["device"], panel["test"]): panel for panel in known["panels"]}
+    small = "srn_cars/test, 32×32 pixels, 3 scenes, 12 views"
+    assert set(panels) == {
+        ("Test CPU", f"{small}, split f00"),
+        ("Fast GPU", f"{small}, split f00"),
+        ("Test CPU", f"{small}, split abc"),
+        ("Test CPU", "srn_cars/test, 64×64 pixels, 3 scenes, 12 views"),
+    }
+    assert ids(known, panels["Test CPU", f"{small}, split f00"]["frontiers"]["psnr"]["scene_s"]) == FRONTIERS["psnr"]
+    assert len(panels["Fast GPU", f"{small}, split f00"]["members"]) == 1
+
+
+def test_units_are_the_pages(tmp_path):
+    row = result(peak_mem_bytes=3 * 2**30, field_queries=6_000_000, denoiser_calls=24)
+    values = content(chart(write_results(tmp_path, row)))["configurations"][0]["values"]
+    assert values["peak_mem_bytes"] == [3.0]
+    assert values["field_queries"] == [2.0]  # millions, per scene
+    assert values["denoiser_calls"] == [8.0]
+    assert values["scene_s"] == [8.0, 7.6, 8.4]
+
+
+def test_tables_and_pictures_lie_beside_the_page(tmp_path):
+    rows = [*(result(name) for name in KNOWN), failed("slow", 1)]
+    page = build_chart(load_config("chart", [f"results={write_results(tmp_path / 'runs', *rows)}"]))
+    assert page == tmp_path / "runs" / "chart" / "index.html"
+    lines = read_csv(page.parent / "configurations.csv")
+    assert [float(line["psnr"]) for line in lines] == [known[2] for known in KNOWN.values()]
+    assert [line["failed"] for line in lines] == ["0", "0", "0", "1", "0"]
+    assert [line["status"] for line in read_csv(page.parent / "runs.csv")] == ["ok"] * 5 + ["oom"]
+    assert {path.name for path in page.parent.glob("*.png")} == {"psnr-scene_s.png", "st_lpips_vgg-scene_s.png"}
+    with Image.open(page.parent / "psnr-scene_s.png") as image:
+        assert image.size == (1080, 660 + 3 * 0.16 * 120 // 1)  # and a line for each of the frontier
+    pngs = chart(tmp_path / "runs", out=str(tmp_path / "other"), png__costs=["denoiser_calls"]).parent.glob("*.png")
+    assert {path.name for path in pngs} == {"psnr-denoiser_calls.png", "st_lpips_vgg-denoiser_calls.png"}
+
+
+def test_pictures_are_found_and_small_ones_carried_along(tmp_path):
+    first, second = result(folder="run a#1"), result("best", folder="run2")
+    write_sheet(tmp_path / "run a#1")
+    write_sheet(tmp_path / "run2")
+    for scene in ("000", "001"):
+        orbit = tmp_path / "run2" / "predictions" / "sds" / scene / "orbit.mp4"
+        orbit.parent.mkdir(parents=True)
+        orbit.touch()
+    write_results(tmp_path, first, second, result("slow", folder="gone"))
+    one, two, three = content(chart(tmp_path))["configurations"]
+    assert (one["runs"][0]["sheet"], one["runs"][0]["folder"]) == ("../run%20a%231/sheet.png", "../run%20a%231")
+    assert two["runs"][0]["orbit"] == "../run2/predictions/sds/000/orbit.mp4"
+    assert "orbit" not in one["runs"][0] and "sheet" not in three["runs"][0] and three["small"] is None
+    assert one["small"].startswith("data:image/webp;base64,")
+    # one is more than so little: the other is a link alone
+    few = content(chart(tmp_path, pictures__megabytes=0.01))["configurations"]
+    assert [entry["small"] for entry in few] == [None] * 3
+    smaller = content(chart(tmp_path, pictures__width=64))["configurations"][0]["small"]
+    assert len(smaller) < len(one["small"]) / 4
+
+
+def test_configurations_are_called_by_what_tells_them_apart(tmp_path):
+    known = content(chart(write_results(tmp_path, *(result(name) for name in KNOWN))))
+    assert [entry["labels"] for entry in known["configurations"]] == [
+        {"strategy": strategy, "inner_steps": str(2**n)} for n, (strategy, *_) in enumerate(KNOWN.values())
+    ]
+    settings = [("cheap", None, "torch"), ("good", 25, "torch"), ("slow", 25, "triton")]
+    rows = [
+        result(name, overrides=[f"a.steps={n}", f"b.steps={n % 2}"], K=K, backend=backend)
+        for n, (name, K, backend) in enumerate(settings)
+    ]
+    entries = content(chart(write_results(tmp_path / "x", *rows)))["configurations"]
+    # K is what the strategies that have it have alike; steps of two kinds are told apart
+    assert [entry["labels"] for entry in entries] == [
+        {"strategy": "none", "a.steps": "0", "b.steps": "0", "backend": "torch"},
+        {"strategy": "ngd", "a.steps": "1", "b.steps": "1", "backend": "torch"},
+        {"strategy": "ngd", "a.steps": "2", "b.steps": "0", "backend": "triton"},
+    ]
+
+
+def test_failed_runs_are_told_and_keep_their_reason(tmp_path):
+    known = content(chart(write_results(tmp_path, result(), failed("slow", 4, status="nan", error="rgb of <b>"))))
+    (entry,) = known["failures"]
+    assert (entry["status"], entry["error"], entry["seed"]) == ("nan", "rgb of <b>", 4)
+    assert "strategy=ngd" in [known["words"][number] for number in entry["overrides"]]
+    assert entry["command"].startswith("python src/distill.py seed=4")
+
+
+def test_published_values_stand_with_their_source_beside_the_dataset_they_are_of(tmp_path):
+    cars, chairs = result(), result(dataset="srn_chairs/test", image_size=[128, 128])
+    known = content(chart(write_results(tmp_path, cars, chairs, result(dataset="posed_images/test"))))
+    assert len(known["configurations"]) == 3
+    by_test = {panel["test"].split(",")[0]: panel["published"] for panel in known["panels"]}
+    assert by_test["posed_images/test"] == []
+    cars = {entry["method"]: entry for entry in by_test["srn_cars/test"]}
+    assert cars["NerfDiff-B"]["metrics"] == {"psnr": 23.51, "ssim": 0.92, "lpips": 0.082, "fid": 18.09}
+    # four views to a scene
+    assert cars["pixelNeRF"]["costs"]["scene_s"] == pytest.approx(0.007 + 4 * 1.639)
+    assert "GPU not named" in cars["pixelNeRF"]["source"] and cars["SRN"]["costs"] == {}
+    assert not cars["SRN"]["same_size"] and all(entry["same_size"] for entry in by_test["srn_chairs/test"])
+    assert {entry["source"] for entry in by_test["srn_chairs/test"]} and len(by_test["srn_chairs/test"]) == 14
+
+
+ENTRY = {"method": "X", "dataset": "srn_cars", "image_size": 1, "psnr": 1.0, "source": "nobody"}
+SPEED = {"encode_s": 1.0, "render_s": 1.0, "source": "ssdnerf"}
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"published__values": [ENTRY], "published__speeds": {}}, "published.values: X: source 'nobody'"),
+        ({"published__speeds": {"SRN": SPEED | {"source": "?"}}}, "published.speeds: SRN: source"),
+        ({"published__speeds": {"Nobody": SPEED}}, "published.speeds: .* Nobody"),
+        ({"png__costs": ["money"]}, "png.costs: money is not among"),
+    ],
+)
+def test_what_is_wrong_in_the_config_is_named(tmp_path, settings, words):
+    with pytest.raises(ConfigError, match=words):
+        chart(write_results(tmp_path, result()), **settings)
+
+
+def test_results_of_another_schema_are_named_and_do_not_hide_the_others(tmp_path):
+    write_results(tmp_path / "new", result())
+    old = write_results(tmp_path / "old", result()) / "results.jsonl"
+    old.write_text(re.sub(r'"schema_version": \d+', '"schema_version": 1', old.read_text()))
+    known = content(chart(tmp_path))
+    assert len(known["configurations"]) == 1
+    (line,) = known["unread"]
+    assert str(old) in line and "schema version 1" in line
+    for results in (old, tmp_path / "old"):
+        with pytest.raises(DataError, match="schema version 1"):
+            chart(results)
+
+
+def test_empty_folders_and_failures_alone_make_pages_that_say_so(tmp_path):
+    known = content(chart(write_results(tmp_path / "empty")))
+    assert known["panels"] == [] and "There are no results in" in known["empty"]
+    known = content(chart(write_results(tmp_path / "failed", failed(), failed("slow"))))
+    assert known["panels"] == [] and known["empty"].startswith("All 2 runs in") and len(known["failures"]) == 2
+    with pytest.raises(DataError, match="does not exist"):
+        chart(tmp_path / "nowhere")
+    with pytest.raises(ConfigError, match="names nothing"):
+        chart([])
+
+
+def test_several_results_make_one_page(tmp_path):
+    write_results(tmp_path / "a", result())
+    write_results(tmp_path / "b", result("slow"))
+    page = chart([tmp_path / "a" / "results.jsonl", tmp_path / "b"])
+    assert page.parent == tmp_path / "a" / "chart" and len(content(page)["configurations"]) == 2
+    assert len(content(chart(tmp_path))["configurations"]) == 2

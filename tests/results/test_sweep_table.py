@@ -11,12 +11,14 @@ from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from nerfdiff.errors import DataError
+from nerfdiff.errors import ConfigError, DataError
 from nerfdiff.evaluation import measure
 from nerfdiff.metrics.predictions import FORMAT
+from nerfdiff.results import sweep_grid, sweep_orbits
 from nerfdiff.results.hashes import sha256_values
 from nerfdiff.results.intervals import Bootstrap
 from nerfdiff.results.row import ResultRow, append_row, read_rows
+from nerfdiff.results.sweep_frontier import Frontier
 from nerfdiff.results.sweep_jobs import counterpart, group, jobs_of, planned
 from nerfdiff.results.sweep_lines import lines_of, read_scenes
 from nerfdiff.results.sweep_table import SweepTable
@@ -203,13 +205,18 @@ def test_damaged_scores_are_named(tmp_path):
     assert math.isnan(read_scenes(path)["psnr"]["a"]) and "ssim" not in read_scenes(path)
 
 
-def table():
-    return SweepTable(["strategy"], {"strategy": "none"}, {}, [], BOOTSTRAP)
+def table(frontier=None, pause=0.0):
+    return SweepTable(["strategy"], {"strategy": "none"}, {}, [], BOOTSTRAP, frontier, pause)
 
 
 def test_a_failure_that_no_row_tells_of_becomes_one(tmp_path, monkeypatch):
     overrides = ["strategy=none", "seed=0"]
-    monkeypatch.setattr(measure, "_overrides", lambda: overrides)  # Hydra's, of the job that has just ended
+
+    def record(cfg, error, subject, strategy):  # the real one asks Hydra for the job that has just ended
+        row = ResultRow(run_id="x", overrides=overrides, strategy="none", seed=0, status="error", error=str(error))
+        append_row(cfg.results, row)
+
+    monkeypatch.setattr(measure, "record_failure", record)
     config = sweep(tmp_path, {"strategy": "none", "seed": "0"})
     callback = table()
     callback.on_multirun_start(config)
@@ -229,3 +236,67 @@ def test_a_sweep_without_any_success_says_so_and_fails(tmp_path):
     with pytest.raises(SystemExit, match="no job of this sweep succeeded"):
         callback.on_multirun_end(OmegaConf.create())
     assert "not run" in (tmp_path / "table.md").read_text() and not (tmp_path / "grid.png").exists()
+
+
+def test_the_frontier_is_of_one_device_and_of_each_quality(tmp_path):
+    seconds = {"none": 1.0, "sds": 2.0, "ngd": 3.0, "ngd_current": 4.0, "cdm": 5.0}
+    psnr = {"none": 20.0, "sds": 19.0, "ngd": 21.0, "ngd_current": 20.5, "cdm": 18.0}
+    config = sweep(tmp_path, {"strategy": ",".join(seconds), "seed": "0"})
+    for strategy, value in psnr.items():
+        write_job(
+            tmp_path,
+            [f"strategy={strategy}", "seed=0"],
+            strategy,
+            0,
+            [value, value],
+            fd_st_vgg=100.0 - 10 * seconds[strategy],
+            scene_s={"n": 1, "median": seconds[strategy], "iqr": 0.0},
+            device="cpu" if strategy != "cdm" else "GPU",
+        )
+    groups = group(jobs_of(config), ["strategy"])
+    found = lines_of(groups, BOOTSTRAP, {}, {}, [])
+    marked = Frontier("scene_s", {"psnr": "higher", "fd_st_vgg": "lower", "fid": "lower"})(groups, found)
+    assert {line.name: line.frontier for line in marked} == {
+        "none": ("psnr", "fd_st_vgg"),
+        "sds": ("fd_st_vgg",),  # another pays less for more PSNR
+        "ngd": ("psnr", "fd_st_vgg"),
+        "ngd_current": ("fd_st_vgg",),
+        "cdm": ("psnr", "fd_st_vgg"),  # the only one of its device
+    }
+    rows = list(csv.DictReader(io.StringIO(to_csv(marked))))
+    assert rows[1]["frontier"] == "fd_st_vgg" and "| PSNR, FD ST-VGG |" in to_markdown(marked)
+    with pytest.raises(ConfigError, match="psnr takes higher or lower"):
+        Frontier("scene_s", {"psnr": "up"})
+
+
+def test_terminal_and_pictures_show_the_frontier(swept, tmp_path, monkeypatch, capsys):
+    seconds = {"n": 2, "median": 9.0, "iqr": 0.0}
+    for seed in (0, 1):  # costs more than ngd for less
+        overrides = [f"seed={seed}", "strategy=sds", "ckpt=demo"]
+        write_job(tmp_path, overrides, "sds", seed, [20.0, 20.0], distill_s=seconds)
+    shown = []
+    for module, name in ((sweep_grid, "grid"), (sweep_orbits, "orbits")):
+        monkeypatch.setattr(module, name, lambda *arguments: shown.extend(arguments) and None)
+    callback = table(Frontier("distill_s", {"psnr": "higher"}))
+    callback.on_multirun_start(OmegaConf.merge(swept, {"orbit": {}}))
+    callback.on_multirun_end(OmegaConf.create())
+    pictured = [[g.name for g in groups] for groups in shown if isinstance(groups, list)]
+    assert pictured == [["ngd"], ["ngd"]]
+    printed = capsys.readouterr().out
+    assert "ngd" in printed and "sds" not in printed
+    assert "sds" in (tmp_path / "table.md").read_text()
+
+
+def test_the_table_is_written_at_most_so_often_while_the_sweep_runs(swept, tmp_path):
+    callback = table(pause=3600.0)
+    callback.on_multirun_start(swept)
+    done = JobReturn(status=JobStatus.COMPLETED)
+    callback.on_job_end(swept, done)
+    first = (tmp_path / "table.csv").stat().st_mtime_ns
+    callback.on_job_end(swept, done)
+    assert (tmp_path / "table.csv").stat().st_mtime_ns == first
+    table(pause=0.0).on_job_end(swept, done)  # a job by itself is no sweep
+    assert (tmp_path / "table.csv").stat().st_mtime_ns == first
+    callback.pause = 0.0
+    callback.on_job_end(swept, done)
+    assert (tmp_path / "table.csv").stat().st_mtime_ns > first

@@ -9,6 +9,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
 from nerfdiff.results.row import ResultRow, read_rows
+from nerfdiff.sweeps.plan import read_plan
 
 RESULTS = "results.jsonl"
 SEED = "seed"
@@ -74,7 +75,13 @@ def shown(value: str) -> str:
 
 
 def planned(sweep: DictConfig) -> list[tuple[str, ...]]:
-    """The overrides of every job that Hydra's basic sweeper makes of a multirun's config, in its order."""
+    """The overrides of every job of a multirun: those in the plan of our sweeper, or all that Hydra's makes, in order.
+
+    Raises:
+        DataError: the plan is damaged.
+    """
+    if "proposals" in sweep.hydra.sweeper:
+        return read_plan(Path(sweep.hydra.sweep.dir))
     words = [f"{key}={value}" for key, value in (sweep.hydra.sweeper.params or {}).items()]
     choices: dict[str, list[str]] = {}
     for override in OverridesParser.create().parse_overrides([*words, *sweep.hydra.overrides.task]):

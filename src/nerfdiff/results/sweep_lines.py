@@ -16,7 +16,7 @@ from nerfdiff.results.row import ResultRow
 from nerfdiff.results.sweep_jobs import Group, Job, Labels, counterpart
 
 FRECHET = ("fid", "fd_st_vgg")  # one number for all scenes of a run
-PER_RUN = (*FRECHET, "distill_s")
+PER_RUN = (*FRECHET, "distill_s", "scene_s")
 PER_SCENE = (*IMAGE_METRICS, *SCENE_METRICS)
 
 SceneValues = dict[str, float]
@@ -32,6 +32,7 @@ class Line:
         differences: to the reference, scene by scene.
         closed: how much of a Fréchet distance between the reference and the goal is closed; 1 is all of it.
         paper: its numbers.
+        frontier: the qualities in which none that costs less, or as much, is as good.
         status: `ok`, or how many jobs are not.
     """
 
@@ -46,6 +47,7 @@ class Line:
     differences: dict[str, Estimate] = field(default_factory=dict)
     closed: dict[str, float] = field(default_factory=dict)
     paper: dict[str, float] = field(default_factory=dict)
+    frontier: tuple[str, ...] = ()
 
 
 def lines_of(

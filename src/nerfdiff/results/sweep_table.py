@@ -2,6 +2,7 @@
 
 import logging
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,20 +14,20 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from nerfdiff.errors import UserError
-from nerfdiff.evaluation.measure import record_failure
 from nerfdiff.results.files import write_text
 from nerfdiff.results.intervals import Bootstrap
-from nerfdiff.results.sweep_grid import grid
+from nerfdiff.results.sweep_frontier import Frontier
 from nerfdiff.results.sweep_jobs import Group, group, jobs_of
 from nerfdiff.results.sweep_lines import Line, lines_of
-from nerfdiff.results.sweep_orbits import orbits
 from nerfdiff.results.sweep_text import to_csv, to_markdown, to_rich
 
 log = logging.getLogger(__name__)
 
+TABLE = "table.csv"
+
 
 class SweepTable(Callback):
-    """Writes table.csv and table.md into the sweep's folder after every job, and grid.png and orbits.mp4 at the end.
+    """Writes table.csv and table.md into the sweep's folder while it runs, and grid.png and orbits.mp4 at the end.
 
     The jobs of the command are the table: each with the newest row that it left in the sweep's results, so that a
     sweep that goes on after it was killed has every job once. A job without a row is there as `not run`.
@@ -35,6 +36,8 @@ class SweepTable(Callback):
         labels: keys of overrides that tell the table's rows apart; others that the command sweeps over are added.
         reference, goal, paper: see `lines_of`.
         bootstrap: of the intervals.
+        frontier: pictures and terminal show the lines on it alone; None has them show all lines.
+        pause: seconds between two writings of the table while the sweep runs.
     """
 
     def __init__(
@@ -44,9 +47,11 @@ class SweepTable(Callback):
         goal: Mapping[str, str],
         paper: Sequence[Mapping[str, Any]],
         bootstrap: Bootstrap,
+        frontier: Frontier | None,
+        pause: float,
     ):
         self.labels, self.reference, self.goal = labels, reference, goal
-        self.paper, self.bootstrap = paper, bootstrap
+        self.paper, self.bootstrap, self.frontier, self.pause = paper, bootstrap, frontier, pause
         self.sweep: DictConfig | None = None
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
@@ -54,16 +59,25 @@ class SweepTable(Callback):
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """A failure that the job did not record itself becomes a row, and no longer ends the sweep without a table."""
+        if self.sweep is None:  # one job of a sweep, run by itself
+            return
         try:
             _ = job_return.return_value
         except Exception as error:
             log.exception("this job of the sweep failed")
             job_return.status, job_return.return_value = JobStatus.COMPLETED, None
             self._told(partial(self._record, config, error))
-        self._told(self._write)
+        if time.time() - self._written >= self.pause:
+            self._told(self._write)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         self._told(self._finish)
+
+    @property
+    def _written(self) -> float:
+        """When, in seconds since the epoch; jobs side by side in several processes share the file alone."""
+        path = Path(self.sweep.hydra.sweep.dir) / TABLE
+        return path.stat().st_mtime if path.is_file() else 0.0
 
     def _told(self, work: Callable[[], object]) -> None:
         try:
@@ -72,6 +86,8 @@ class SweepTable(Callback):
             log.error("the sweep's table: %s", error)
 
     def _record(self, config: DictConfig, error: Exception) -> None:
+        from nerfdiff.evaluation.measure import record_failure  # imports PyTorch: not for who only launches jobs
+
         overrides = set(config.hydra.overrides.task)
         if not any(job.row for job in jobs_of(self.sweep) if set(job.overrides) == overrides):
             record_failure(config, error, None, None)
@@ -79,18 +95,26 @@ class SweepTable(Callback):
     def _write(self) -> tuple[list[Group], list[Line]]:
         groups = group(jobs_of(self.sweep), self.labels)
         lines = lines_of(groups, self.bootstrap, self.reference, self.goal, self.paper)
+        if self.frontier is not None:
+            lines = self.frontier(groups, lines)
         folder = Path(self.sweep.hydra.sweep.dir)
-        write_text(folder / "table.csv", to_csv(lines))
+        write_text(folder / TABLE, to_csv(lines))
         write_text(folder / "table.md", to_markdown(lines))
         return groups, lines
 
     def _finish(self) -> None:
+        from nerfdiff.results.sweep_grid import grid
+        from nerfdiff.results.sweep_orbits import orbits
+
         (groups, lines), folder = self._write(), Path(self.sweep.hydra.sweep.dir)
-        console = Console(width=None if sys.stdout.isatty() else 200)
-        console.print(to_rich(lines))
+        shown = [number for number, line in enumerate(lines) if line.frontier or self.frontier is None]
+        if shown:
+            console = Console(width=None if sys.stdout.isatty() else 200)
+            console.print(to_rich([lines[number] for number in shown]))
         if not any(line.seeds for line in lines):
             # Hydra lets no Exception of a callback end the command
             raise SystemExit(f"error: no job of this sweep succeeded; {folder / 'table.md'} says why")
+        groups = [groups[number] for number in shown]
         pictures = [
             grid(folder / "grid.png", self.sweep, groups),
             orbits(folder / "orbits.mp4", groups, self.sweep.orbit),

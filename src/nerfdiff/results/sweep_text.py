@@ -33,6 +33,7 @@ def to_csv(lines: Sequence[Line]) -> str:
             row |= _parts(f"{name}_difference", estimate)
         row |= {f"{name}_gap_closed": value for name, value in line.closed.items()}
         row |= {f"paper_{name}": value for name, value in line.paper.items()}
+        row |= {"frontier": " ".join(line.frontier)} if line.frontier else {}
         flat.append(row | {"error": line.error})
     columns = list(dict.fromkeys(column for row in flat for column in row if column != "error"))
     text = io.StringIO()
@@ -82,6 +83,7 @@ def cells(lines: Sequence[Line]) -> tuple[list[str], list[list[str]]]:
             add(f"Δ {column.heading}", [_estimate(line.differences.get(name), column, "+") for line in lines])
         add(f"paper: {column.heading}", [_number(line.paper.get(name), column) for line in lines])
         add(f"{column.heading.removesuffix(' ↓')} gap closed", [_share(line.closed.get(name)) for line in lines])
+    add("on the frontier of", [_names(line.frontier) for line in lines])
     add("fell back", [str(line.fallbacks) if line.fallbacks else None for line in lines])
     add("seeds", [str(line.seeds) for line in lines])
     add("scenes", [str(line.scenes) for line in lines])
@@ -105,6 +107,10 @@ def _estimate(estimate: Estimate | None, column: Column, sign: str = "") -> str 
 
 def _number(value: float | None, column: Column, sign: str = "") -> str | None:
     return None if value is None else format(value * column.scale, sign + column.format)
+
+
+def _names(fields: Sequence[str]) -> str | None:
+    return ", ".join(column.heading.rstrip(" ↑↓") for column in COLUMNS if column.field in fields) or None
 
 
 def _share(value: float | None) -> str | None:

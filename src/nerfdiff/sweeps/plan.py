@@ -1,0 +1,30 @@
+"""The jobs of a sweep in a file, for its table and for who wants to know what is still to come."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from nerfdiff.errors import DataError
+from nerfdiff.results.files import write_text
+
+PLAN = "plan.json"
+
+
+def write_plan(folder: Path, jobs: Sequence[Sequence[str]]) -> None:
+    """Save the overrides of each job in the sweep's folder."""
+    write_text(folder / PLAN, json.dumps({"jobs": [list(job) for job in jobs]}, indent=1) + "\n")
+
+
+def read_plan(folder: Path) -> list[tuple[str, ...]]:
+    """The overrides of each job; none where no sweep has begun.
+
+    Raises:
+        DataError: the file is damaged.
+    """
+    path = folder / PLAN
+    try:
+        return [tuple(job) for job in json.loads(path.read_text(encoding="utf-8"))["jobs"]]
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path}: cannot be read ({error}); delete it and run the sweep again") from error

@@ -1,11 +1,13 @@
 # Two commands do everything on a fresh machine with Python 3.11 or newer:
 #   make demo   set up, render small scenes, train, evaluate, write pictures and tables
 #   make test   set up, run the tests
+# and a third one looks at what ran: make dashboard (LOGDIR=… for one sweep)
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+LOGDIR ?= runs
 
-.PHONY: setup demo test lint dashboard clean
+.PHONY: setup browser demo test lint dashboard clean
 
 setup: $(VENV)/.installed
 
@@ -18,7 +20,14 @@ $(VENV)/.installed: pyproject.toml
 demo: setup
 	$(BIN)/python src/demo.py
 
-test: setup lint
+# The chart's page is tested in headless Chromium. Where there is none and it cannot be installed, its tests are skipped.
+browser:
+	@command -v chromium >/dev/null || command -v chromium-browser >/dev/null || command -v google-chrome >/dev/null || { \
+		test "$$(id -u)" = 0 && command -v apt-get >/dev/null && apt-get update -qq && \
+		DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends chromium >/dev/null; } || \
+		echo "no Chromium: the tests of the chart's page will be skipped"
+
+test: setup lint browser
 	$(BIN)/python -m pytest
 
 lint: setup
@@ -26,7 +35,8 @@ lint: setup
 	$(BIN)/ruff format --check .
 
 dashboard: setup
-	$(BIN)/tensorboard --logdir runs
+	( sleep 5; $(BIN)/python -m webbrowser 'http://localhost:6006/#custom_scalars' ) & \
+	$(BIN)/tensorboard --logdir $(LOGDIR) --port 6006 --samples_per_plugin images=100
 
 clean:
 	rm -rf runs/demo data/demo

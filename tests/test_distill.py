@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import shlex
 import shutil
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 import torch
 from hydra.utils import instantiate
 from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from nerfdiff.cli import load_config
 from nerfdiff.distill.distillation import Distillation
@@ -53,8 +55,6 @@ def overrides(data, run, out, *more) -> list[str]:
         "budget.rays=64",
         "budget.views=3",
         "orbit.frames=3",
-        "timing.repeats=1",
-        "timing.warmup=0",
         "metrics.st_lpips=false",
         *more,
     )
@@ -74,6 +74,10 @@ def test_every_scene_leaves_its_field_views_orbit_and_trace(strategy, data, run,
     row = distill(config(data, run, tmp_path, f"strategy={strategy}"))
     assert row.status == "ok" and row.n_scenes == 2 and row.fallbacks == 0 and row.psnr > 0
     assert row.K == 3 and row.prior == "SRNSpiral"
+    parts = [row.denoise_s, row.fit_s, row.guide_s, row.encode_s, row.render_s]
+    assert all(part["n"] == 1 and part["median"] > 0 for part in parts)  # the first of two scenes warms up
+    assert sum(part["median"] for part in parts) < row.distill_s["median"] == row.scene_s["median"]
+    assert 0 < row.timing_s < 0.01 * row.scene_s["median"]
     for scene in ("scene0", "scene1"):
         folder = scene_folder(tmp_path, strategy, scene)
         for name in (FIELD, "trace.csv", "trace.png", "orbit.mp4"):
@@ -83,6 +87,8 @@ def test_every_scene_leaves_its_field_views_orbit_and_trace(strategy, data, run,
             trace = list(csv.DictReader(file))
         assert len(trace) == STEPS and all(float(step["loss_last"]) > 0 for step in trace)
         assert [bool(step["t"]) for step in trace] == [strategy == "ngd"] * STEPS
+    events = EventAccumulator(str(next((tmp_path / "tensorboard" / "curves").iterdir()))).Reload()
+    assert len(events.Scalars("distill/agreement")) == STEPS and len(events.Scalars("scenes/psnr")) == 2
     assert next(tmp_path.glob(f"{strategy}-*/sheet.png")).stat().st_size > 1000
 
 
@@ -127,16 +133,27 @@ def test_scenes_fitted_together_are_what_they_are_alone(data, run, tmp_path):
         distill(config(data, run, tmp_path / "none", "scenes_at_once=0"))
 
 
-def test_a_scene_that_fell_back_says_so(data, run, tmp_path, monkeypatch):
+def poison(monkeypatch, *scenes: str) -> None:
+    """Their second targets are not numbers."""
     fit = NGDModule._fit
 
     def poisoned(self, targets):
         if len(self._records) == 1:
-            sick = [views.seed[-1] == "scene1" for views in self.views]
+            sick = [views.seed[-1] in scenes for views in self.views]
             targets = targets * torch.where(torch.tensor(sick), float("nan"), 1.0).reshape(-1, 1, 1, 1, 1)
         return fit(self, targets)
 
     monkeypatch.setattr(NGDModule, "_fit", poisoned)
+
+
+def test_a_run_of_which_no_scene_is_well_diverged(data, run, tmp_path, monkeypatch):
+    poison(monkeypatch, "scene0", "scene1")
+    row = distill(config(data, run, tmp_path))
+    assert row.status == "diverged" and row.fallbacks == 2 and row.psnr > 0
+
+
+def test_a_scene_that_fell_back_says_so(data, run, tmp_path, monkeypatch):
+    poison(monkeypatch, "scene1")
     row = distill(config(data, run, tmp_path))
     assert row.status == "ok" and row.fallbacks == 1 and row.error == "fell back: 1 scenes non-finite"
     with open(next(tmp_path.glob("ngd-*/scores/ngd/per_scene.csv"))) as file:
@@ -201,7 +218,9 @@ def test_two_processes_make_what_one_does(data, run, tmp_path):
             timeout=300,
         )
         assert done.returncode == 0, done.stderr[-3000:]
-        return read_rows(out / "results.jsonl")
+        (row,) = read_rows(out / "results.jsonl")
+        assert row.command == shlex.join(["python", "src/distill.py", *arguments])
+        return [row]
 
     (alone,) = command(tmp_path / "one")
     (shared,) = command(tmp_path / "two", "processes=2")

@@ -2,6 +2,7 @@ import json
 
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from nerfdiff.checkpoint import export, load_model
 from nerfdiff.cli import load_config
@@ -31,8 +32,6 @@ def config(data, run, out, *more):
         run,
         out,
         "orbit.frames=4",
-        "timing.repeats=2",
-        "timing.warmup=1",
         *more,
     )
     return load_config("evaluate", overrides)
@@ -44,6 +43,7 @@ def test_an_evaluation_leaves_rows_scores_and_pictures(data, run, tmp_path, stra
     name = rows[0].strategy
     assert [row.strategy for row in rows] == [name, "copy_input", "mean_image"]
     assert [row.strategy for row in read_rows(tmp_path / "results.jsonl")] == [row.strategy for row in rows]
+    assert rows[1].scene_s is rows[1].model is rows[1].backend is rows[1].grad_norm_p99 is None
     for row in rows:
         assert row.status == "ok" and row.n_scenes == 2 and row.n_views == 2 * 4
         assert 0 < row.psnr < 60 and row.ssim_impl == "skimage-uniform7" and row.st_lpips_vgg > 0
@@ -55,6 +55,11 @@ def test_an_evaluation_leaves_rows_scores_and_pictures(data, run, tmp_path, stra
     assert (folder / "sheet.png").stat().st_size > 1000
     assert (folder / "orbit.mp4").stat().st_size > 500
     assert name in (folder / "table.md").read_text()
+    runs = {path.parent.relative_to(tmp_path / "tensorboard").as_posix() for path in tmp_path.rglob("events.*")}
+    main = {folder.name, f"{folder.name}/copy_input", f"{folder.name}/mean_image"}
+    assert runs == main | {f"curves/{run}" for run in main}
+    events = EventAccumulator(str(tmp_path / "tensorboard" / folder.name)).Reload()
+    assert events.Scalars("accuracy/psnr")[0].value == pytest.approx(rows[0].psnr) and events.Images("pictures")
     assert len({row.run_id for row in rows}) == 3
 
 
@@ -65,9 +70,18 @@ def test_costs_are_counted(data, run, tmp_path):
     assert none.field_queries == cdm.field_queries == pixels * 8  # 4 + 4 samples per ray
     assert (none.denoiser_calls, cdm.denoiser_calls) == (0, 8 * 3)
     assert none.distill_s is None and cdm.distill_s["n"] == 1
-    assert none.encode_s["n"] == none.render_s["n"] == 2
     assert none.depth_rmse is not None and none.mask_iou is not None
     assert none.params == cdm.params > 100_000
+    assert none.scene_s["n"] == 1 and none.denoise_s is None
+    assert cdm.scene_s == cdm.distill_s and cdm.fit_s is None
+    assert 0 < cdm.guide_s["median"] + cdm.denoise_s["median"] < cdm.distill_s["median"]
+    assert (none.model, none.field, none.samples_per_ray) == ("tiny", "triplane", 8)
+    assert (none.backend, none.compile, none.scenes_at_once) == ("torch", False, 1)
+    assert none.nonfinite_grad_steps == 0 and none.grad_norm_p99 > 0  # of the training run
+    assert none.encode_s["n"] == none.render_s["n"] == cdm.encode_s["n"] == 1  # the first of two scenes warms up
+    assert none.encode_s["median"] + 4 * none.render_s["median"] < none.scene_s["median"] and cdm.render_s is None
+    for row in (none, cdm):  # what clocks take of a scene
+        assert 0 < row.timing_s < 0.01 * row.scene_s["median"]
 
 
 def test_copying_the_input_scores_what_the_files_say(data, run, tmp_path):
@@ -158,7 +172,14 @@ def test_another_resolution_than_in_training_is_named(data, run, tmp_path):
         evaluate(config(data, run, tmp_path, "data.image_size=null"))
 
 
-@pytest.mark.parametrize(("setting", "word"), [("device=cuda:7", "device=auto"), ("precision=16-mixed", "bf16-mixed")])
+@pytest.mark.parametrize(
+    ("setting", "word"),
+    [
+        ("device=cuda:7", "device=auto"),
+        ("precision=16-mixed", "bf16-mixed"),
+        ("kernel_precision=fp8", "kernel_precision='fp8': choose auto, ieee"),
+    ],
+)
 def test_what_this_machine_cannot_do_is_said(data, run, tmp_path, setting, word):
     with pytest.raises(ConfigError, match=word):
         evaluate(config(data, run, tmp_path, setting))
@@ -207,3 +228,14 @@ def test_predictions_name_their_source_view(data, run, tmp_path):
     evaluate(config(data, run, tmp_path, "baselines=false"))
     (scene,) = tmp_path.glob("none-*/predictions/none/scene0/scene.json")
     assert json.loads(scene.read_text())["source_views"] == ["000000"]
+
+
+def test_samples_per_ray_can_be_other_ones_than_in_training(data, run, tmp_path):
+    settings = ["baselines=false", "metrics.st_lpips=false", "orbit.scenes=0", "sheet.scenes=0"]
+    asked = ["uniform_samples=2", "importance_samples=3"]
+    few, trained = (evaluate(config(data, run, tmp_path, *settings, *more))[0] for more in (asked, []))
+    assert (few.samples_per_ray, trained.samples_per_ray) == (5, 8)
+    assert few.field_queries * 8 == trained.field_queries * 5 > 0 and few.psnr != trained.psnr
+    assert few.folder != trained.folder and few.config_sha256 != trained.config_sha256
+    with pytest.raises(ConfigError, match="importance_samples=0 must be at least 1"):
+        evaluate(config(data, run, tmp_path, *settings, "importance_samples=0"))

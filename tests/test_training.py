@@ -8,10 +8,13 @@ import time
 import pytest
 import torch
 from lightning import Callback
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.custom_scalar import layout_pb2
+from tensorboard.plugins.hparams import api_pb2, metadata
 
 from nerfdiff import training
 from nerfdiff.checkpoint import load_model
-from nerfdiff.errors import CheckpointError, DataError
+from nerfdiff.errors import CheckpointError, ConfigError, DataError
 from training_fixtures import (
     assert_same_state,
     command,
@@ -67,6 +70,39 @@ def test_a_run_leaves_what_a_person_looks_for(whole):
     assert sorted(p.name for p in (run / "previews").iterdir()) == ["step_0000003.png", "step_0000006.png"]
     assert any((run / "tensorboard").glob("events.*"))
     assert {"val/psnr", "val/loss_dm", "train/loss_ic", "train/loss_dm", "train/grad_norm"} <= metrics.keys()
+
+
+def test_a_run_shows_itself_in_tensorboard(whole):
+    """Settings and status for the HPARAMS tab, the config as text, pictures, and charts of tags that there are."""
+    run, metrics = whole
+    events = EventAccumulator(str(run / "tensorboard")).Reload()
+    said = events.PluginTagToContent(metadata.PLUGIN_NAME)
+    assert metadata.EXPERIMENT_TAG not in said  # one run's columns would be all runs'
+    start = metadata.parse_session_start_info_plugin_data(said[metadata.SESSION_START_INFO_TAG])
+    assert start.hparams["model.name"].string_value == "tiny" and start.hparams["data.batch_size"].number_value == 4
+    end = metadata.parse_session_end_info_plugin_data(said[metadata.SESSION_END_INFO_TAG])
+    assert end.status == api_pb2.STATUS_SUCCESS
+    assert events.Scalars("val/psnr")[-1].value == pytest.approx(metrics["val/psnr"])
+    tags = events.Tags()
+    (layout,) = events.Tensors("custom_scalars__config__")
+    charts = layout_pb2.Layout.FromString(layout.tensor_proto.string_val[0]).category[0].chart
+    shown = {tag for chart in charts for tag in chart.multiline.tag}
+    assert "val/psnr" in shown and shown <= set(tags["scalars"])
+    assert "hp_metric" not in tags["scalars"] and "input | render | depth | cdm | truth" in tags["images"]
+    config = events.Tensors("config/text_summary")[0].tensor_proto.string_val[0].decode()
+    assert "batch_size: 4" in config
+
+
+def test_a_run_that_failed_says_so_in_tensorboard(data, tmp_path, monkeypatch):
+    class Fail(Callback):
+        def on_train_batch_end(self, *args):
+            raise ValueError("broken")
+
+    with pytest.raises(ValueError, match="broken"):
+        train_with(monkeypatch, Fail(), data, tmp_path)
+    said = EventAccumulator(str(tmp_path / "tensorboard")).Reload().PluginTagToContent(metadata.PLUGIN_NAME)
+    end = metadata.parse_session_end_info_plugin_data(said[metadata.SESSION_END_INFO_TAG])
+    assert end.status == api_pb2.STATUS_FAILURE
 
 
 def test_training_lowers_the_loss(data, tmp_path):
@@ -206,6 +242,11 @@ def test_training_goes_on_without_a_validation_split(data, tmp_path):
     (root / "cars_train").symlink_to(data / "cars_train")
     metrics = run_training(root, tmp_path / "run")
     assert "val/psnr" not in metrics and last_checkpoint(tmp_path / "run")["global_step"] == 6
+
+
+def test_an_unknown_kernel_precision_is_named(data, tmp_path):
+    with pytest.raises(ConfigError, match="kernel_precision='fp8': choose auto, ieee"):
+        run_training(data, tmp_path / "run", "kernel_precision=fp8")
 
 
 def test_a_missing_root_is_named(tmp_path):

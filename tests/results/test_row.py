@@ -1,9 +1,11 @@
 import csv
+import fcntl
 import json
 import math
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,8 @@ CONTRACT = {
     *("seed", "dataset", "split_sha256", "n_scenes", "n_views", "ckpt_sha256", "weights", "strategy", "prior"),
     *("K", "psnr", "ssim", "ssim_impl", "lpips", "lpips_net", "fid", "fid_n", "st_lpips_vgg", "fd_st_vgg"),
     *("encode_s", "render_s", "distill_s", "denoiser_calls", "field_queries", "peak_mem_bytes", "params"),
+    *("command", "model", "field", "samples_per_ray", "backend", "compile", "scenes_at_once"),
+    *("denoise_s", "fit_s", "guide_s", "scene_s", "timing_s"),
     *("device", "cpu", "torch", "cuda", "precision", "lightning", "hydra"),
     *("nonfinite_grad_steps", "loss_spikes", "grad_norm_p99"),
 }
@@ -62,18 +66,18 @@ def test_unknown_status_is_refused():
 def test_rows_of_another_schema_version_are_refused(tmp_path):
     path = tmp_path / "results.jsonl"
     append_row(path, row())
-    append_row(path, row(schema_version=2))
-    with pytest.raises(DataError, match=r"results\.jsonl, line 2: schema version 2, this program reads 1"):
+    append_row(path, row(schema_version=1))
+    with pytest.raises(DataError, match=r"results\.jsonl, line 2: schema version 1, this program reads 2"):
         read_rows(path)
 
 
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ('{"schema_version": 1, "run', "line 1: not JSON"),
+        ('{"schema_version": 2, "run', "line 1: not JSON"),
         ("[1]", "schema version None"),
-        ('{"schema_version": 1, "run_id": "x", "psnrr": 3}', "unknown fields psnrr"),
-        ('{"schema_version": 1}', "run_id"),
+        ('{"schema_version": 2, "run_id": "x", "psnrr": 3}', "unknown fields psnrr"),
+        ('{"schema_version": 2}', "run_id"),
     ],
 )
 def test_damaged_lines_are_named(tmp_path, line, message):
@@ -91,7 +95,7 @@ def test_a_torn_line_does_not_swallow_the_next_row(tmp_path):
     path = tmp_path / "results.jsonl"
     append_row(path, row(run_id="before"))
     with open(path, "a") as file:
-        file.write('{"schema_version": 1, "run_')
+        file.write('{"schema_version": 2, "run_')
     append_row(path, row(run_id="after"))
     lines = path.read_text().splitlines()
     assert len(lines) == 3 and json.loads(lines[2])["run_id"] == "after"
@@ -125,6 +129,22 @@ def test_four_processes_at_once_lose_and_mix_nothing(tmp_path):
     rows = read_rows(path)
     assert {r.run_id for r in rows} == {f"{name}-{i}" for name in "abcd" for i in range(50)}
     assert len(rows) == 200 and all(r.error == "x" * 20_000 for r in rows)
+
+
+def test_a_reader_waits_for_a_row_that_is_being_written(tmp_path):
+    append_row(tmp_path / "one.jsonl", row())
+    line, path = (tmp_path / "one.jsonl").read_text(), tmp_path / "results.jsonl"
+    with open(path, "w") as file, ThreadPoolExecutor() as threads:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        file.write(line[:100])
+        file.flush()
+        reading = threads.submit(read_rows, path)
+        with pytest.raises(TimeoutError):
+            reading.result(timeout=0.2)
+        file.write(line[100:])
+        file.flush()
+        fcntl.flock(file, fcntl.LOCK_UN)
+        assert [r.run_id for r in reading.result(timeout=60)] == ["r1"]
 
 
 def test_reading_results_needs_no_pytorch():

@@ -10,7 +10,9 @@ from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.field_file import SavedField
 from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.distill.strategy import Views
+from nerfdiff.field.kinds import TRIPLANE
 from nerfdiff.model import NerfDiff
+from nerfdiff.results.timing import timed
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,11 @@ class SingleImageNeRF:
         predicted = []
         for scene in scenes:
             encoding = model.encode(scene.source, scene.source_cameras, scene.near, scene.far)
-            field = RefinedField(encoding.triplane, model.decoder)
-            predicted.append(Views.of_field(SavedField(field, model.renderer), scene.target_cameras))
+            if model.field_name == TRIPLANE:
+                field = RefinedField(encoding.triplane, model.decoder)
+                predicted.append(Views.of_field(SavedField(field, model.renderer), scene.target_cameras))
+            else:  # nothing there that could be kept without the model
+                with timed("render"):
+                    rendering = model.render(encoding, scene.target_cameras)
+                predicted.append(Views.of_rendering(rendering, model.renderer, scene.target_cameras))
         return predicted

@@ -10,6 +10,7 @@ from nerfdiff.distill.fixed_images import FixedImages
 from nerfdiff.distill.virtual_views import VirtualViews
 from nerfdiff.field.encoder import Encoding
 from nerfdiff.randomness import generator
+from nerfdiff.results.timing import timed
 
 
 class AutoregressiveViews(FixedImages):
@@ -58,7 +59,8 @@ class AutoregressiveViews(FixedImages):
                 if known not in conditions:
                     conditions[known] = _condition(views, encodings[known], known, view)
                     views.field_queries += model.renderer.samples_per_ray * z[0, 0].numel()
-                x0 = model.denoiser(z, t[None], conditions[known]).clamp(-1, 1)
+                with timed("denoise"):
+                    x0 = model.denoiser(z, t[None], conditions[known]).clamp(-1, 1)
                 views.denoiser_calls += 1
                 z = run.step(z, x0, t, t_next, views.noise_of(view)[None] if run.needs_noise else None)
             images.append(0.5 * (x0 + 1))
@@ -72,4 +74,6 @@ def _condition(views: VirtualViews, encoding: Encoding, known: int, view: int) -
     wanted = views.cameras[:, view : view + 1]
     if known > 0:
         wanted = wanted.relative_to(views.cameras[:, known - 1 : known])
-    return views.model.condition(encoding, wanted, views.model.render(encoding, wanted))
+    with timed("guide"):
+        rendering = views.model.render(encoding, wanted)
+    return views.model.condition(encoding, wanted, rendering)

@@ -1,7 +1,7 @@
 """What a test-time method is: one input image and a trained model to images of other views."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -15,6 +15,8 @@ from nerfdiff.distill.field_file import SavedField
 from nerfdiff.distill.trace import Step
 from nerfdiff.metrics.depth import z_depth
 from nerfdiff.model import NerfDiff
+from nerfdiff.render.renderer import Renderer, Rendering
+from nerfdiff.results.timing import timed
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,7 @@ class Views:
     status: str = "ok"
 
     @staticmethod
+    @timed("render")
     @torch.no_grad()
     def of_field(
         saved: SavedField,
@@ -57,15 +60,24 @@ class Views:
             denoiser_calls, field_queries: what it took to make the field; rendering is added here.
         """
         rendering = saved.field.render(saved.renderer, cameras)
+        views = Views.of_rendering(rendering, saved.renderer, cameras)
+        return replace(
+            views,
+            denoiser_calls=denoiser_calls,
+            field_queries=field_queries + views.field_queries,
+            field=saved,
+            trace=trace,
+            status=status,
+        )
+
+    @staticmethod
+    def of_rendering(rendering: Rendering, renderer: Renderer, cameras: Cameras) -> "Views":
+        """What `renderer` made of a field that is not kept, of leading shape [1, views, height, width]."""
         return Views(
             images=rendering.rgb[0].movedim(-1, 1),
             opacity=rendering.opacity[0],
             depth=z_depth(rendering.depth[0], cameras[0]),
-            denoiser_calls=denoiser_calls,
-            field_queries=field_queries + saved.renderer.samples_per_ray * rendering.opacity.numel(),
-            field=saved,
-            trace=trace,
-            status=status,
+            field_queries=renderer.samples_per_ray * rendering.opacity.numel(),
         )
 
 

@@ -13,6 +13,7 @@ from nerfdiff.diffusion.denoiser import Condition
 from nerfdiff.field.encoder import Encoding
 from nerfdiff.model import NerfDiff
 from nerfdiff.randomness import generator
+from nerfdiff.results.timing import timed
 
 Images = Float[Tensor, "views 3 height width"]
 
@@ -38,7 +39,9 @@ class VirtualViews:
         self._conditions: list[Condition] = []
         for part in self._parts:
             chunk = cameras[:, part]
-            self._conditions.append(model.condition(encoding, chunk, model.render(encoding, chunk)))
+            with timed("guide"):
+                rendering = model.render(encoding, chunk)
+            self._conditions.append(model.condition(encoding, chunk, rendering))
         self._noise = [generator(encoding.source.device, *seed, view) for view in range(len(self))]
         self.denoiser_calls = 0
         self.field_queries = model.renderer.samples_per_ray * self.first_renderings[:, 0].numel()
@@ -55,6 +58,7 @@ class VirtualViews:
         """For `denoise` along one reverse process; None where all is computed."""
         return None if deep is None or deep.every == 1 else [DeepFeatures(deep) for _ in self._parts]
 
+    @timed("denoise")
     @torch.no_grad()
     def denoise(
         self,

@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 
 from nerfdiff.distill.strategy import Strategy
 from nerfdiff.errors import ConfigError
+from nerfdiff.evaluation.dashboard import show_in_dashboard
 from nerfdiff.evaluation.evaluate import show
 from nerfdiff.evaluation.measure import measure, record_failure
 from nerfdiff.evaluation.pictures import sheet
@@ -28,8 +29,8 @@ def distill(cfg: DictConfig) -> ResultRow | None:
     """Run `cfg.strategy` over the test scenes of `cfg.data`, or over the picture `cfg.image`.
 
     Leaves in `<cfg.paths.output_dir>/<strategy>-<identity>/predictions/<strategy>/<scene>/` the rendered views, the
-    field, its trace and an orbit; beside them scores and a contact sheet, and a row in `cfg.results`. Scenes that
-    are done are skipped. Every process makes its share of the scenes.
+    field, its trace and an orbit; beside them scores and a contact sheet, and a row in `cfg.results`, which TensorBoard
+    shows (`cfg.dashboard`). Scenes that are done are skipped. Every process makes its share of the scenes.
 
     Returns:
         the row; None for a picture, whose other views nobody knows, and in all processes but the first.
@@ -55,9 +56,10 @@ def distill(cfg: DictConfig) -> ResultRow | None:
             log.exception("this job of the sweep failed")
             return row
         raise
-    if cfg.sheet.scenes > 0:
-        log.info("contact sheet: %s", sheet(subject, [strategy], subject.folder / "sheet.png"))
+    pictures = sheet(subject, [strategy], subject.folder / "sheet.png") if cfg.sheet.scenes > 0 else None
+    log.info("contact sheet: %s", pictures or "none")
     if row is not None:
+        show_in_dashboard(cfg, [row], pictures)
         show([row], subject.folder / "table.md")
     log.info("fields, traces and orbits: %s", subject.predictions / strategy.name)
     return row

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from nerfdiff.distill.baselines import CopyInput, MeanImage, mean_training_image
 from nerfdiff.distill.strategy import Strategy
+from nerfdiff.evaluation.dashboard import show_in_dashboard
 from nerfdiff.evaluation.measure import measure, record_failure
 from nerfdiff.evaluation.pictures import sheet, video
 from nerfdiff.evaluation.predict import predict
@@ -25,8 +26,9 @@ def evaluate(cfg: DictConfig) -> list[ResultRow]:
     """Evaluate `cfg.strategy`, and the baselines beside it, on one split of a dataset.
 
     Leaves in `<cfg.paths.output_dir>/<strategy>-<identity>/`: `predictions/<strategy>/`, `scores/<strategy>/`, a
-    contact sheet, an orbit video and a table; appends a row per strategy to `cfg.results`. Scenes already predicted
-    by the same model with the same settings on the same files are not predicted again.
+    contact sheet, an orbit video and a table; appends a row per strategy to `cfg.results` and shows it in TensorBoard
+    (`cfg.dashboard`). Scenes already predicted by the same model with the same settings on the same files are not
+    predicted again.
 
     Returns:
         the strategy's row, then the baselines'.
@@ -51,8 +53,9 @@ def evaluate(cfg: DictConfig) -> list[ResultRow]:
         except Exception as error:
             record_failure(cfg, error, subject, strategy)
             raise
-    if cfg.sheet.scenes > 0:
-        log.info("contact sheet: %s", sheet(subject, strategies, subject.folder / "sheet.png"))
+    pictures = sheet(subject, strategies, subject.folder / "sheet.png") if cfg.sheet.scenes > 0 else None
+    log.info("contact sheet: %s", pictures or "none")
+    show_in_dashboard(cfg, rows, pictures)
     if cfg.orbit.scenes > 0:
         log.info("video: %s", video(subject, strategies[0], subject.folder / "orbit.mp4"))
     show(rows, subject.folder / "table.md")

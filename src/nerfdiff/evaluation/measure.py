@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections import Counter
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,15 @@ from omegaconf import DictConfig
 
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.distill.strategy import Strategy
-from nerfdiff.evaluation.predict import costs
-from nerfdiff.evaluation.subject import Subject
+from nerfdiff.errors import ConfigError
+from nerfdiff.evaluation.costs import cost_fields, model_fields
+from nerfdiff.evaluation.dashboard import show_in_dashboard
+from nerfdiff.evaluation.subject import Subject, choose_device
 from nerfdiff.metrics.predictions import NonFinitePrediction
 from nerfdiff.metrics.score import Scorer, truth_from
 from nerfdiff.results.environment import environment
 from nerfdiff.results.hashes import sha256_values
 from nerfdiff.results.row import ResultRow, append_row
-from nerfdiff.results.timing import summarise, time_calls
 from nerfdiff.training import plain
 
 log = logging.getLogger(__name__)
@@ -30,7 +31,11 @@ def measure(subject: Subject, strategy: Strategy, scorer: Scorer, reader: SceneR
     """Score the predictions of one strategy and append its row; one that has no model is timed by nothing."""
     scores = subject.folder / "scores" / strategy.name
     summary = scorer.score(subject.predictions / strategy.name, truth_from(reader), scores, subject.device)
-    row = replace(_identified(subject, strategy), **summary, **_cost(subject, strategy))
+    row = replace(_identified(subject, strategy), **summary, **cost_fields(subject, strategy))
+    if row.fallbacks:
+        log.warning("%s %s of %d", strategy.name, row.error, row.n_scenes)
+        # where every scene fell back, the numbers are of the fields that distillation began with
+        row = replace(row, status="diverged" if row.fallbacks == row.n_scenes else "ok")
     append_row(subject.cfg.results, row)
     return row
 
@@ -38,10 +43,10 @@ def measure(subject: Subject, strategy: Strategy, scorer: Scorer, reader: SceneR
 def record_failure(cfg: DictConfig, error: Exception, subject: Subject | None, strategy: Strategy | None) -> ResultRow:
     """A run that failed is a row too, with its status; where it failed early, little else is known of it."""
     if subject is not None and strategy is not None:
-        row = _identified(subject, strategy)
+        row = replace(_identified(subject, strategy), **model_fields(subject))
     else:
         name = strategy.name if strategy is not None else cfg.strategy.name
-        row = ResultRow(run_id=f"{cfg.run_name}/{name}", overrides=_overrides(), seed=cfg.seed, strategy=name)
+        row = ResultRow(run_id=f"{cfg.run_name}/{name}", strategy=name, **_asked_for(cfg), **_environment(cfg))
     status = "error"
     if isinstance(error, NonFinitePrediction):
         status = "nan"
@@ -49,6 +54,7 @@ def record_failure(cfg: DictConfig, error: Exception, subject: Subject | None, s
         status = "oom"
     row = replace(row, status=status, error=str(error))
     append_row(cfg.results, row)
+    show_in_dashboard(cfg, [row])
     return row
 
 
@@ -62,53 +68,34 @@ def _identified(subject: Subject, strategy: Strategy) -> ResultRow:
         run_id=f"{cfg.run_name}/{strategy.name}-{config_hash[:8]}",
         config_sha256=config_hash,
         folder=os.path.relpath(subject.folder, Path(cfg.results).parent),
-        overrides=_overrides(),
-        seed=cfg.seed,
-        dataset=f"{cfg.data.name}/{cfg.data.test_split}",
         strategy=strategy.name,
         prior=prior and type(prior).__name__,
         K=prior and prior.views,
+        **_asked_for(cfg),
         **environment(subject.device, subject.precision),
         **{key: subject.identity[key] for key in ("ckpt_sha256", "weights", "split_sha256", "image_size")},
     )
 
 
-def _overrides() -> list[str] | None:
-    return list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else None
+def _asked_for(cfg: DictConfig) -> dict[str, Any]:
+    """What the config and the command say of a run."""
+    known = {"seed": cfg.seed, "dataset": f"{cfg.data.name}/{cfg.data.test_split}"}
+    if not HydraConfig.initialized():
+        return known
+    return known | {"overrides": list(HydraConfig.get().overrides.task), "command": _command(HydraConfig.get())}
 
 
-def _cost(subject: Subject, strategy: Strategy) -> dict[str, Any]:
-    """The cost fields of the row, and how many scenes fell back."""
-    scenes = costs(subject, strategy)
-    fields: dict[str, Any] = {
-        "denoiser_calls": sum(int(cost["denoiser_calls"]) for cost in scenes),
-        "field_queries": sum(int(cost["field_queries"]) for cost in scenes),
-    }
-    if fields["field_queries"] == 0:
-        return fields  # a baseline: no model ran
-    fields |= _model_timings(subject) | {"peak_mem_bytes": max(cost["peak_mem_bytes"] for cost in scenes)}
-    fields["params"] = subject.model.parameter_count()["total"]
-    if fields["denoiser_calls"]:
-        # The first batch of scenes warms up, unless it is the only one.
-        seconds = [cost["seconds"] for cost in scenes]
-        fields["distill_s"] = summarise(seconds[scenes[0]["together"] :] or seconds)
-    fallen = Counter(cost["status"] for cost in scenes if cost["status"] != "ok")
-    if fallen:
-        fields["error"] = "fell back: " + ", ".join(f"{count} scenes {status}" for status, count in fallen.items())
-        log.warning("%s %s of %d", strategy.name, fields["error"], len(scenes))
-    return fields | {"fallbacks": fallen.total()}
+def _command(hydra: DictConfig) -> str:
+    """The shell command that does what this job does, from the project's folder."""
+    words = ["python", f"src/{hydra.job.config_name}.py"]
+    if any(word.startswith("sweep=") for word in hydra.overrides.task):
+        words.append("hydra.mode=RUN")  # the settings of a sweep's jobs, and not the sweep again
+    return shlex.join([*words, *hydra.overrides.task])
 
 
-@torch.no_grad()
-def _model_timings(subject: Subject) -> dict[str, Any]:
-    """Seconds to encode one image and to render one view, the quantities of the paper's speed table."""
-    scene, model = next(iter(subject.load(subject.scene_ids[:1]))).to(subject.device), subject.model
-    repeats = {"n": subject.cfg.timing.repeats, "warmup": subject.cfg.timing.warmup, "device": subject.device}
-    with subject.autocast():
-        inputs = (scene.source, scene.source_cameras, scene.near, scene.far)
-        encoding = model.encode(*inputs)
-        camera = scene.target_cameras[:, :1]
-        return {
-            "encode_s": time_calls(lambda: model.encode(*inputs), **repeats),
-            "render_s": time_calls(lambda: model.render(encoding, camera), **repeats),
-        }
+def _environment(cfg: DictConfig) -> dict[str, Any]:
+    """Of a run that failed before it had a device, as far as that can be told."""
+    try:
+        return environment(choose_device(cfg.device), None if cfg.precision == "auto" else cfg.precision)
+    except ConfigError:
+        return {}

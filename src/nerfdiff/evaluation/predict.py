@@ -1,8 +1,8 @@
 """Scene after scene: predictions, and what is left beside them."""
 
 import json
-import resource
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import islice
@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from nerfdiff.callbacks.distillation_bar import DistillationBar
+from nerfdiff.cpu_memory import peak_memory
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.field_file import FIELD, SavedField, load_field, save_field
 from nerfdiff.distill.strategy import Strategy, Views
@@ -24,7 +25,7 @@ from nerfdiff.metrics.image import psnr
 from nerfdiff.metrics.predictions import SCENE, PredictionWriter
 from nerfdiff.orbit import orbit
 from nerfdiff.results.pictures import orbit_video
-from nerfdiff.results.timing import Stopwatch
+from nerfdiff.results.timing import PartClock, Stopwatch
 
 ORBIT = "orbit.mp4"
 
@@ -48,16 +49,27 @@ def predict(subject: Subject, strategy: Strategy, rank: int = 0, processes: int 
         console=Console(stderr=True),
     ) as bar:
         task = bar.add_task(strategy.name, total=len(pending), told="")
-        callbacks = [DistillationBar(lambda told: bar.update(task, told=told))]
+        # to tell how far it is, the host waits for the device: not where nobody looks
+        callbacks = [] if bar.disable else [DistillationBar(lambda told: bar.update(task, told=told))]
+        warm = False
         loaded = iter(subject.load(pending)) if pending else iter(())
         while scenes := [scene.to(subject.device) for scene in islice(loaded, subject.cfg.scenes_at_once)]:
-            watch = Stopwatch(subject.device)
-            with watch.measure(), subject.autocast():
+            watch, clock = Stopwatch(subject.device), PartClock(subject.device)
+            with watch.measure(), clock.running(), subject.autocast():
                 predicted = strategy.predict(subject.model, scenes, subject.cfg.seed, callbacks)
+            spent = _shares(watch.seconds[0], clock.seconds(), predicted) | {"warm": warm}
+            warm = True
             for scene, views in zip(scenes, predicted, strict=True):
-                seconds = watch.seconds[0] / len(scenes)
-                score = _write(subject, strategy, writer, scene, views, seconds, len(scenes))
+                score = _write(subject, strategy, writer, scene, views, spent)
                 bar.update(task, advance=1, told="" if score is None else f"PSNR {score:.2f}")
+
+
+def _shares(seconds: float, parts: Mapping[str, Sequence[float]], predicted: Sequence[Views]) -> dict[str, float]:
+    """Seconds of scenes made together: of an encoding, of rendering a view, and else for each scene as if alone."""
+    spent = {"seconds": seconds, "pieces": sum(map(len, parts.values()))}
+    spent |= {name: sum(pieces) for name, pieces in parts.items()}
+    of = {"encode": len(parts.get("encode", ())), "render": sum(len(views.images) for views in predicted)}
+    return {name: value / of.get(name, len(predicted)) for name, value in spent.items()}
 
 
 def _write(
@@ -66,10 +78,9 @@ def _write(
     writer: PredictionWriter,
     scene: ViewBatch,
     views: Views,
-    seconds: float,
-    together: int,
+    spent: Mapping[str, float],
 ) -> float | None:
-    """Save one scene's views, made with others in `together * seconds`; their PSNR, where there is a truth."""
+    """Save one scene's views, and what was `spent` on it, see `_shares`; their PSNR, if there is a truth."""
     writer.write(
         scene.scene_ids[0],
         scene.target_views[0],
@@ -78,8 +89,7 @@ def _write(
         depth=views.depth,
         opacity=views.opacity,
         cost={
-            "seconds": seconds,
-            "together": together,
+            **spent,
             "peak_mem_bytes": _peak_memory(subject.device),
             "denoiser_calls": views.denoiser_calls,
             "field_queries": views.field_queries,
@@ -134,7 +144,7 @@ def _peak_memory(device: torch.device) -> int:
     """Bytes so far: allocated on a GPU; on a CPU the process's resident set, everything it imports included."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return peak_memory()
 
 
 def _writer(subject: Subject, strategy: Strategy) -> PredictionWriter:

@@ -1,6 +1,6 @@
 """What is evaluated on what: a model, scenes, and all that predictions of one run share."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,6 +31,7 @@ class Subject:
         load: batches of one scene each, of these ids.
         identity: what makes predictions comparable; other settings of it, other predictions.
         folder: of all that the run leaves.
+        stability: of the model's training, see `LoadedModel`.
         data: where the scenes come from; None for a picture, whose other views nobody knows.
     """
 
@@ -42,6 +43,7 @@ class Subject:
     precision: str
     identity: dict[str, Any]
     folder: Path
+    stability: Mapping[str, float | int | None]
     data: SceneDataModule | None
 
     @property
@@ -145,22 +147,37 @@ def _subject(
     precision = cfg.precision if cfg.precision != "auto" else auto_precision(device.type)
     if precision not in PRECISIONS:
         raise ConfigError(f"precision must be auto, {' or '.join(PRECISIONS)}, got {precision!r}")
+    samples = {
+        name: getattr(loaded.model.renderer, name) if cfg[name] is None else cfg[name]
+        for name in ("uniform_samples", "importance_samples")
+    }
+    for name, number in samples.items():
+        if number < 1:
+            raise ConfigError(f"{name}={number} must be at least 1, or null for what the model was trained with")
     identity = facts | {
         "ckpt_sha256": sha256_file(loaded.path),
         "weights": loaded.weights,
         "seed": cfg.seed,
         "precision": precision,
+        "kernel_precision": cfg.kernel_precision,
+        "samples": samples,
         "device": device.type,  # whose generators draw the noise
         "orbit": cfg.per_scene and cfg.orbit.frames,
         "strategy": plain(cfg.strategy),
     }
     folder = Path(cfg.paths.output_dir) / f"{cfg.strategy.name}-{sha256_values(identity)[:8]}"
     model = loaded.model.to(device).requires_grad_(False)
-    model.renderer = replace(model.renderer, backend=cfg.backend, chunk=cfg.chunk or model.renderer.chunk)
+    model.renderer = replace(
+        model.renderer,
+        backend=cfg.backend,
+        kernel_precision=cfg.kernel_precision,
+        chunk=cfg.chunk or model.renderer.chunk,
+        **samples,
+    )
     channels_last = cfg.channels_last
     if channels_last is None:
         channels_last = device.type == "cpu" or cfg.compile != "none"
     if channels_last:
         model.to(memory_format=torch.channels_last)
     compile_unets(model, cfg.compile, cfg.paths.compiled_dir)
-    return Subject(cfg, model, load, scene_ids, device, precision, identity, folder, data)
+    return Subject(cfg, model, load, scene_ids, device, precision, identity, folder, loaded.stability, data)

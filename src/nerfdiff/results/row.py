@@ -21,7 +21,7 @@ from typing import Any
 from nerfdiff.errors import DataError
 from nerfdiff.results.files import write_text
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 STATUSES = ("ok", "nan", "oom", "diverged", "error", "timeout")
 NONFINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
@@ -32,11 +32,16 @@ Timing = dict[str, float | int]
 class ResultRow:
     """One measured run. None means not measured or not applicable.
 
-    `folder` is where predictions and scores lie, relative to the file of results. Timings are dicts
-    {n, median, iqr} in seconds, see `timing`: `encode_s` and `distill_s` per scene, `render_s` per view. `fid_n` is
-    the number of images on either side of `fid` and `fd_st_vgg`; `n_views` counts all scored images;
-    `consistency_n` scenes were measured for consistency. `fallbacks` counts the scenes whose distillation failed and
-    which kept an earlier field; `error` says how.
+    `folder` is where predictions and scores lie, relative to the file of results. `command` makes the row again.
+    Timings are dicts {n, median, iqr} in seconds, see `timing`: `encode_s` per image, `render_s` per view (of all
+    predicted views of a scene in one call), the others per scene. `scene_s` is a scene from its input image to all its
+    predicted views, whatever the method; `distill_s` is the same of methods that call the denoiser, and `denoise_s`
+    (denoiser calls), `fit_s` (field updates) and `guide_s` (renderings of virtual views, which the denoiser sees and is
+    guided by) are parts of it; the rest is mostly encoding and rendering. `timing_s` are the seconds per scene that
+    measuring cost the run. `samples_per_ray` counts coarse and fine ones. `fid_n` is the number of images on either
+    side of `fid` and `fd_st_vgg`; `n_views` counts all scored images; `consistency_n` scenes were measured for
+    consistency. `fallbacks` counts the scenes whose distillation failed and which kept an earlier field; `error` says
+    how; where all did, the status is `diverged`. The three after it are of the training run that made the checkpoint.
     """
 
     # identity
@@ -49,6 +54,7 @@ class ResultRow:
     git_dirty: bool | None = None
     config_sha256: str | None = None
     folder: str | None = None
+    command: str | None = None
     overrides: list[str] | None = None
     seed: int | None = None
     dataset: str | None = None
@@ -58,9 +64,15 @@ class ResultRow:
     image_size: list[int] | None = None
     ckpt_sha256: str | None = None
     weights: str | None = None
+    model: str | None = None
+    field: str | None = None
     strategy: str | None = None
     prior: str | None = None
     K: int | None = None
+    samples_per_ray: int | None = None
+    backend: str | None = None
+    compile: bool | None = None
+    scenes_at_once: int | None = None
     # metrics
     psnr: float | None = None
     ssim: float | None = None
@@ -90,6 +102,11 @@ class ResultRow:
     encode_s: Timing | None = None
     render_s: Timing | None = None
     distill_s: Timing | None = None
+    denoise_s: Timing | None = None
+    fit_s: Timing | None = None
+    guide_s: Timing | None = None
+    scene_s: Timing | None = None
+    timing_s: float | None = None
     denoiser_calls: int | None = None
     field_queries: int | None = None
     peak_mem_bytes: int | None = None
@@ -155,14 +172,16 @@ def append_row(path: str | Path, row: ResultRow) -> None:
 
 
 def read_rows(path: str | Path) -> list[ResultRow]:
-    """All rows of a file, oldest first.
+    """All rows of a file, oldest first; writers wait meanwhile, so that none is seen half.
 
     Raises:
         DataError: the file is missing, a line is damaged, or a row is of another schema version; the message
             names the line.
     """
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
+        with open(path, encoding="utf-8") as file:
+            fcntl.flock(file, fcntl.LOCK_SH)
+            lines = file.read().split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"cannot read results {path}: {error}") from error
     return [_parse(line, f"{path}, line {number}") for number, line in enumerate(lines, 1) if line.strip()]

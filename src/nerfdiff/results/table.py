@@ -42,6 +42,7 @@ COLUMNS = (
     Column("encode_s_median", "encode, s", ".3g"),
     Column("render_s_median", "render, s/view", ".3g"),
     Column("distill_s_median", "distil, s", ".3g"),
+    Column("scene_s_median", "scene, s", ".3g"),
     Column("peak_mem_bytes", "memory, GiB", ".2f", 2**-30),
     Column("params", "parameters, M", ".1f", 1e-6),
     Column("dataset", "dataset"),

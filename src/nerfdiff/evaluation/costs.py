@@ -1,0 +1,75 @@
+"""What predictions cost: the fields of a row, from what was written down of each scene."""
+
+from collections import Counter
+from typing import Any
+
+import torch
+
+from nerfdiff.distill.strategy import Strategy
+from nerfdiff.evaluation.predict import costs
+from nerfdiff.evaluation.subject import Subject
+from nerfdiff.render import backend
+from nerfdiff.results.row import Timing
+from nerfdiff.results.timing import cost_of_a_piece, summarise
+
+PARTS = ("denoise", "fit", "guide")
+STABILITY = ("nonfinite_grad_steps", "loss_spikes", "grad_norm_p99")
+
+
+def cost_fields(subject: Subject, strategy: Strategy) -> dict[str, Any]:
+    """The cost fields of a row, with what computed: `model_fields`, the backend, and how many scenes fell back.
+
+    Only counts for a baseline, of which no model ran.
+    """
+    scenes = costs(subject, strategy)
+    fields: dict[str, Any] = {
+        "denoiser_calls": sum(int(cost["denoiser_calls"]) for cost in scenes),
+        "field_queries": sum(int(cost["field_queries"]) for cost in scenes),
+    }
+    if fields["field_queries"] == 0:
+        return fields
+    fields["scene_s"] = _timing(scenes, "seconds")
+    fields |= {f"{name}_s": _timing(scenes, name) for name in ("encode", "render")}
+    if fields["denoiser_calls"]:
+        fields["distill_s"] = fields["scene_s"]
+        fields |= {f"{name}_s": _timing(scenes, name) for name in PARTS}
+    pieces = sum(cost.get("pieces", 0) for cost in scenes)
+    fields["timing_s"] = cost_of_a_piece(subject.device) * pieces / len(scenes)
+    fields |= model_fields(subject) | {"backend": _backend(subject)}
+    fields["peak_mem_bytes"] = max(cost["peak_mem_bytes"] for cost in scenes)
+    fallen = Counter(cost["status"] for cost in scenes if cost["status"] != "ok")
+    if fallen:
+        fields["error"] = "fell back: " + ", ".join(f"{count} scenes {status}" for status, count in fallen.items())
+    return fields | {"fallbacks": fallen.total()}
+
+
+def model_fields(subject: Subject) -> dict[str, Any]:
+    """What computes, as far as it is known before anything was computed."""
+    model = subject.model
+    return {
+        "model": model.name,
+        "field": model.field_name,
+        "params": model.parameter_count()["total"],
+        "samples_per_ray": model.renderer.samples_per_ray,
+        "compile": subject.cfg.compile != "none",
+        "scenes_at_once": subject.cfg.scenes_at_once,
+    } | {name: subject.stability.get(name) for name in STABILITY}
+
+
+def _timing(scenes: list[dict[str, Any]], name: str) -> Timing | None:
+    """Of the scenes that came after a process's first, which warm it up; of all where there are no others."""
+    measured = [cost for cost in scenes if name in cost]
+    warm = [cost[name] for cost in measured if cost.get("warm")]
+    return summarise(warm or [cost[name] for cost in measured])
+
+
+@torch.no_grad()
+def _backend(subject: Subject) -> str:
+    """What renders, whatever was asked for."""
+    model = subject.model
+    if model.renderer.backend == "torch" or (model.renderer.backend == "auto" and subject.device.type == "cpu"):
+        return "torch"
+    scene = next(iter(subject.load(subject.scene_ids[:1]))).to(subject.device)
+    with subject.autocast():
+        field = model.field(model.encode(scene.source, scene.source_cameras, scene.near, scene.far))
+        return backend.chosen(model.renderer, field, scene.target_cameras[:, 0].rays(scene.near, scene.far))

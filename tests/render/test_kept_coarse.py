@@ -113,6 +113,15 @@ def test_rays_that_met_nothing_or_no_numbers_are_sampled_evenly():
         torch.testing.assert_close(out.rgb, even.rgb)
 
 
+def test_weights_are_kept_in_parts_and_in_mixed_precision():
+    rays = bundle()
+    whole = Renderer(4, 4, 1.0, 10**6).render(blobs, rays, keep_coarse=True)
+    with torch.autocast("cpu", torch.bfloat16):
+        parts = Renderer(4, 4, 1.0, 9).render(blobs, rays, keep_coarse=True)
+    assert parts.coarse.dtype == KEPT
+    torch.testing.assert_close(parts.coarse, whole.coarse, atol=0.02, rtol=0)
+
+
 def test_whole_views_keep_weights_by_pixel():
     source = input_cameras(1, 3, 5)
     cameras = Cameras(torch.stack([torch.eye(4), look_at((0.9, -0.4, 0.7))])[None], source.K.expand(1, 2, 3, 3), 3, 5)

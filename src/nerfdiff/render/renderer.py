@@ -1,6 +1,6 @@
 """The reference volume renderer: plain PyTorch, bounded memory."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +11,7 @@ from torch.utils.checkpoint import checkpoint
 from nerfdiff.cameras import Cameras, Rays
 from nerfdiff.field import cpu_field
 from nerfdiff.field.field import FieldFn, PixelField
+from nerfdiff.precision import full_precision
 from nerfdiff.render.backend import check_choice, fused
 from nerfdiff.render.compositing import compositing_weights
 from nerfdiff.render.sampling import KEPT, edges_between, importance_distances, in_bins, uniform_edges
@@ -111,7 +112,7 @@ class Renderer:
             self._in_chunks(alone, own, keep_coarse, recompute)
             for alone, own in zip(cpu_field.scene_by_scene(field), _split(parts, 1, 0), strict=True)
         ]
-        return Rendering(*(torch.cat(values) for values in zip(*outputs, strict=True)))
+        return Rendering(*_joined(outputs, axis=0))
 
     def render_views(
         self,
@@ -162,7 +163,7 @@ class Renderer:
                 outputs.append(checkpoint(self._render, *given, use_reentrant=False, preserve_rng_state=False))
             else:
                 outputs.append(self._render(*given))
-        return [torch.cat(values, dim=1) for values in zip(*outputs, strict=True)]
+        return _joined(outputs, axis=1)
 
     def _render(self, field, keep_coarse, origins, directions, near, far, jitter, coarse):
         rays = Rays(origins, directions, near, far)
@@ -221,3 +222,9 @@ def _split(parts: dict[str, Tensor], size: int, axis: int) -> Iterator[dict[str,
     """All parts, so many entries of an axis at a time."""
     for values in zip(*(part.split(size, axis) for part in parts.values()), strict=True):
         yield dict(zip(parts, values, strict=True))
+
+
+def _joined(outputs: Sequence[Sequence[Tensor]], axis: int) -> list[Tensor]:
+    """Value by value, what parts of the rays gave."""
+    with full_precision(outputs[0][0].device):  # autocast on a CPU cannot join halves
+        return [torch.cat(values, axis) for values in zip(*outputs, strict=True)]

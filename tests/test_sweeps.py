@@ -72,7 +72,7 @@ def test_a_sweep_ends_in_a_table_though_jobs_fail(tmp_path):
         sys.executable, str(SRC / "distill.py"), "sweep=conditioning", "cdm=concat,rendered", "seed=0",
         f"paths.runs_dir={tmp_path / 'runs'}", f"data.root={data}", "data.cache=false", "data.image_size=[20,28]",
         "data.source_view=0", "data.num_workers=0", "data.eval_stride=2", "budget=minutes", "budget.steps=1",
-        "budget.sampler_steps=1", "budget.inner_steps=1", "budget.views=2",
+        "budget.sampler_steps=1", "budget.inner_steps=1", "budget.rays=1", "budget.views=2",
         "orbit.frames=0", "sheet.scenes=1", "metrics.st_lpips=false",
         "threads=1",
     ]  # fmt: skip

@@ -11,17 +11,15 @@ import numpy as np
 import pandas as pd
 
 from nerfdiff.errors import DataError
-from nerfdiff.metrics.summary import IMAGE_METRICS, SCENE_METRICS
 from nerfdiff.results.intervals import Bootstrap, Estimate, spread
 from nerfdiff.results.row import ResultRow, flatten, read_rows
+from nerfdiff.results.sweep_jobs import RESULTS
+from nerfdiff.results.sweep_lines import FRECHET, PER_SCENE
 
-RESULTS = "results.jsonl"
-PER_SCENE = (*IMAGE_METRICS, *SCENE_METRICS)
-PER_RUN = ("fid", "fd_st_vgg")  # one number for all scenes of a run
 TIMINGS = ("scene_s", "distill_s", "denoise_s", "fit_s", "guide_s", "encode_s", "render_s")
 COUNTS = ("denoiser_calls", "field_queries")  # of all scenes of a run; a table has them per scene
 SIZES = ("peak_mem_bytes", "params", "timing_s")
-QUALITIES = (*PER_SCENE, *PER_RUN)
+QUALITIES = (*PER_SCENE, *FRECHET)
 COSTS = (*TIMINGS, *COUNTS, *SIZES)
 IDENTITY = (
     "dataset", "split_sha256", "n_scenes", "n_views", "image_size", "ckpt_sha256", "weights", "model", "field",

@@ -1,5 +1,7 @@
 """What the tracer counts, on tensors whose sizes are known, and what is done with it."""
 
+import gc
+
 import pytest
 import torch
 
@@ -50,6 +52,19 @@ def test_recomputing_at_more_resolutions_keeps_less():
         for choice in (False, [1], [2], True)
     ]
     assert sizes == sorted(sizes, reverse=True) and len(set(sizes)) == 4
+
+
+@pytest.mark.parametrize("choice", [False, True])
+def test_a_trace_does_not_depend_on_when_garbage_is_collected(choice):
+    often, thresholds = (3, 1, 1), gc.get_threshold()
+    sizes = set()
+    for setting in (thresholds, often):
+        gc.set_threshold(*setting)
+        try:
+            sizes.add(training_memory(config(unet={"checkpointing": choice}), 8, 1, 16, 16, "32-true").step)
+        finally:
+            gc.set_threshold(*thresholds)
+    assert len(sizes) == 1 and gc.isenabled()
 
 
 @pytest.mark.parametrize("batch", [1, 5])

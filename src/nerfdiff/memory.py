@@ -1,5 +1,6 @@
 """What a training step will take, found out on the meta device before anything is allocated."""
 
+import gc
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -106,6 +107,20 @@ def like_a_gpu(mixed: bool) -> Iterator[None]:
             setattr(F, name, function)
 
 
+@contextmanager
+def no_garbage_collection() -> Iterator[None]:
+    """Whoever traces sees the same each time, and the most: checkpointing leaves cycles that hold tensors, and which
+    of them Python collects in time depends on all that ran before.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
 @dataclass(frozen=True)
 class TrainingMemory:
     """Bytes of one training process.
@@ -137,7 +152,7 @@ def training_memory(
     """
     model = build_on_meta(model_config)
     parameters = sum(p.numel() for p in model.parameters())
-    with PeakMemory() as tracker, torch.device("meta"), like_a_gpu(precision == "bf16-mixed"):
+    with no_garbage_collection(), PeakMemory() as tracker, torch.device("meta"), like_a_gpu(precision == "bf16-mixed"):
         _step(model, batch_size, target_views, height, width)
     return TrainingMemory(WEIGHTS_ADAM_EMA * parameters, tracker.peak)
 

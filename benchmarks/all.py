@@ -1,4 +1,4 @@
-"""All five benchmarks in turn, within a given time: what to run on a machine that is lent for minutes.
+"""All six benchmarks in turn, within a given time: what to run on a machine that is lent for minutes.
 
     python benchmarks/all.py --minutes 10
     python benchmarks/all.py --minutes 25 --model base --compile --sweeps
@@ -16,8 +16,9 @@ from pathlib import Path
 import torch
 
 from harness import RESULTS
+from nerfdiff.evaluation.subject import choose_device
 
-SHARES = {"render": 1.0, "inner_step": 1.0, "unet": 2.0, "training_step": 3.0, "ngd_object": 3.0}
+SHARES = {"render": 1.0, "inner_step": 1.0, "unet": 2.0, "training_step": 3.0, "ngd_object": 3.0, "field_speed": 2.0}
 SWEEPS = {
     "render": ("rays", "samples", "plane", "scenes"),
     "inner_step": ("rays", "views", "scenes"),
@@ -26,6 +27,8 @@ SWEEPS = {
     "ngd_object": ("scenes",),
 }
 COMPILED = ("unet", "training_step", "ngd_object")
+CPU_RAYS = 512
+"""Of a view, where a CPU renders it by pixel-aligned NeRFs."""
 
 
 def main(words: list[str] | None = None) -> int:
@@ -52,10 +55,14 @@ def main(words: list[str] | None = None) -> int:
 
 def plan(arguments: argparse.Namespace) -> list[tuple[str, float, list[str]]]:
     """(benchmark, share of the time, its options)."""
-    shared = ["--device", arguments.device, "--out", str(arguments.out), "--seconds", str(arguments.seconds)]
-    shared += ["--ckpt", arguments.ckpt] if arguments.ckpt else ["--model", arguments.model]
-    shared += ["--size", str(arguments.size)] if arguments.size else []
-    if arguments.model in ("base", "large") and not arguments.ckpt:
+    anyones = ["--device", arguments.device, "--out", str(arguments.out), "--seconds", str(arguments.seconds)]
+    anyones += ["--size", str(arguments.size)] if arguments.size else []
+    shared = anyones + (["--ckpt", arguments.ckpt] if arguments.ckpt else ["--model", arguments.model])
+    papers = ("base", "large")
+    fields = ["--models", *(papers if arguments.model in papers else (arguments.model,))]
+    if choose_device(arguments.device).type == "cpu":
+        fields += ["--rays", str(CPU_RAYS)]
+    if arguments.model in papers and not arguments.ckpt:
         objects = ["--budget", "paper"] + ([] if arguments.whole_objects else ["--steps", "4", "--extrapolate"])
     else:
         objects = ["--budget", "minutes"]
@@ -63,7 +70,7 @@ def plan(arguments: argparse.Namespace) -> list[tuple[str, float, list[str]]]:
     jobs = []
     for name, share in SHARES.items():
         options = shared + own.get(name, []) + (["--compile"] if arguments.compile and name in COMPILED else [])
-        jobs.append((name, share, options))
+        jobs.append((name, share, options if name != "field_speed" else anyones + fields))
     if arguments.sweeps:
         for name, sweeps in SWEEPS.items():
             whole = ["--whole"] if name == "ngd_object" else []

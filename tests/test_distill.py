@@ -18,7 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from nerfdiff.cli import load_config
 from nerfdiff.distill.distillation import Distillation
 from nerfdiff.distill.field_file import FIELD, load_field
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.errors import ConfigError, DataError, TimeUp
 from nerfdiff.evaluation.distill import distill
 from nerfdiff.evaluation.subject import dataset_subject
 from nerfdiff.metrics.predictions import read_prediction
@@ -173,6 +173,20 @@ def test_a_failure_is_a_row(data, run, tmp_path, monkeypatch):
         distill(config(data, run, tmp_path))
     (row,) = read_rows(tmp_path / "results.jsonl")
     assert (row.status, row.error, row.psnr) == ("oom", "no room", None)
+
+
+def test_a_run_whose_minutes_are_spent_is_a_row_and_goes_on(data, run, tmp_path):
+    short = config(data, run, tmp_path, "minutes=1e-6")
+    with pytest.raises(TimeUp, match=r"after 1 of 2 scenes of ngd; the same command goes on"):
+        distill(short)
+    (row,) = read_rows(tmp_path / "results.jsonl")
+    assert row.status == "timeout" and "minutes=1e-06" in row.error and row.params > 0 and row.psnr is None
+    first = scene_folder(tmp_path, "ngd", "scene0") / FIELD
+    made = first.stat().st_mtime_ns
+    row = distill(short)
+    assert (row.status, row.n_scenes) == ("ok", 2) and first.stat().st_mtime_ns == made
+    with pytest.raises(ConfigError, match="minutes=0 must be more than 0"):
+        distill(config(data, run, tmp_path, "minutes=0"))
 
 
 def test_a_run_that_cannot_begin_is_a_row_too(data, tmp_path):

@@ -23,6 +23,10 @@ class TrainingDiverged(UserError, RuntimeError):
     """Losses or gradients stayed non-finite for too many steps in a row."""
 
 
+class TimeUp(UserError):
+    """A run ended because the minutes it may take were spent, with work left to do."""
+
+
 def some(names: Collection[str], limit: int = 8) -> str:
     """The first few of these names, and how many more there are."""
     names = sorted(names)

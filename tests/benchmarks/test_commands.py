@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import all as all_of_them
+import field_speed
 import inner_step
 import ngd_object
 import render
@@ -119,12 +120,10 @@ def test_the_largest_that_fits(most):
 def test_all_of_them_are_planned_within_the_time(tmp_path):
     arguments = all_of_them._arguments(["--minutes", "5", "--model", "base", "--sweeps", "--out", str(tmp_path)])
     jobs = all_of_them.plan(arguments)
-    assert [name for name, _, _ in jobs[:5]] == list(all_of_them.SHARES)
+    assert [name for name, _, _ in jobs[:6]] == list(all_of_them.SHARES)
+    modules = {m.__name__: m for m in (render, unet, inner_step, ngd_object, training_step, field_speed)}
     for name, _, options in jobs:
-        module = {"render": render, "unet": unet, "inner_step": inner_step, "ngd_object": ngd_object}.get(
-            name, training_step
-        )
-        parsed = module._arguments(options)
+        parsed = modules[name]._arguments(options)
         assert parsed.out == tmp_path and parsed.model == "base"
 
 

@@ -17,7 +17,7 @@ from nerfdiff.evaluation.dashboard import show_in_dashboard
 from nerfdiff.evaluation.evaluate import show
 from nerfdiff.evaluation.measure import measure, record_failure
 from nerfdiff.evaluation.pictures import sheet
-from nerfdiff.evaluation.predict import predict
+from nerfdiff.evaluation.predict import predict, require_all
 from nerfdiff.evaluation.subject import Subject, choose_device, dataset_subject, picture_subject
 from nerfdiff.results.row import ResultRow
 from nerfdiff.training import plain
@@ -47,6 +47,7 @@ def distill(cfg: DictConfig) -> ResultRow | None:
         _predict_together(fabric, subject, strategy)
         if fabric.global_rank > 0:
             return None
+        require_all(subject, strategy)
         row = measure(subject, strategy, scorer, subject.data.reader("test")) if subject.data else None
     except Exception as error:
         if cfg.image or _rank() > 0:

@@ -14,7 +14,7 @@ from nerfdiff.distill.strategy import Strategy
 from nerfdiff.evaluation.dashboard import show_in_dashboard
 from nerfdiff.evaluation.measure import measure, record_failure
 from nerfdiff.evaluation.pictures import sheet, video
-from nerfdiff.evaluation.predict import predict
+from nerfdiff.evaluation.predict import predict, require_all
 from nerfdiff.evaluation.subject import choose_device, dataset_subject
 from nerfdiff.results.row import ResultRow
 from nerfdiff.results.table import rich_table, write_markdown
@@ -49,6 +49,7 @@ def evaluate(cfg: DictConfig) -> list[ResultRow]:
     for strategy in strategies:
         try:
             predict(subject, strategy)
+            require_all(subject, strategy)
             rows.append(measure(subject, strategy, scorer, reader))
         except Exception as error:
             record_failure(cfg, error, subject, strategy)

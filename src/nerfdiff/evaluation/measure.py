@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.distill.strategy import Strategy
-from nerfdiff.errors import ConfigError
+from nerfdiff.errors import ConfigError, TimeUp
 from nerfdiff.evaluation.costs import cost_fields, model_fields
 from nerfdiff.evaluation.dashboard import show_in_dashboard
 from nerfdiff.evaluation.subject import Subject, choose_device
@@ -52,6 +52,8 @@ def record_failure(cfg: DictConfig, error: Exception, subject: Subject | None, s
         status = "nan"
     elif isinstance(error, torch.cuda.OutOfMemoryError | MemoryError):
         status = "oom"
+    elif isinstance(error, TimeUp):
+        status = "timeout"
     row = replace(row, status=status, error=str(error))
     append_row(cfg.results, row)
     show_in_dashboard(cfg, [row])

@@ -1,7 +1,9 @@
 """Scene after scene: predictions, and what is left beside them."""
 
 import json
+import math
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -19,7 +21,7 @@ from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.field_file import FIELD, SavedField, load_field, save_field
 from nerfdiff.distill.strategy import Strategy, Views
 from nerfdiff.distill.trace import PLOT, TRACE, plot_trace, write_trace
-from nerfdiff.errors import ConfigError
+from nerfdiff.errors import ConfigError, TimeUp
 from nerfdiff.evaluation.subject import Subject
 from nerfdiff.metrics.image import psnr
 from nerfdiff.metrics.predictions import SCENE, PredictionWriter
@@ -31,9 +33,19 @@ ORBIT = "orbit.mp4"
 
 
 def predict(subject: Subject, strategy: Strategy, rank: int = 0, processes: int = 1) -> None:
-    """Predict what is still to do of one process's share; a killed run loses at most the scenes in hand."""
+    """Predict what is still to do of one process's share; a killed run loses at most the scenes in hand.
+
+    After `cfg.minutes` no scene begins but the first: `require_all` says so to whoever needs them all.
+
+    Raises:
+        ConfigError: numbers that cannot be.
+    """
     if subject.cfg.scenes_at_once < 1:
         raise ConfigError(f"scenes_at_once={subject.cfg.scenes_at_once} must be at least 1")
+    minutes = subject.cfg.minutes
+    if minutes is not None and minutes <= 0:
+        raise ConfigError(f"minutes={minutes} must be more than 0, or null")
+    until = math.inf if minutes is None else time.monotonic() + 60 * minutes
     writer = _writer(subject, strategy)
     to_do = set(writer.pending())
     pending = [scene for scene in writer.scenes[rank::processes] if scene in to_do]
@@ -62,6 +74,18 @@ def predict(subject: Subject, strategy: Strategy, rank: int = 0, processes: int 
             for scene, views in zip(scenes, predicted, strict=True):
                 score = _write(subject, strategy, writer, scene, views, spent)
                 bar.update(task, advance=1, told="" if score is None else f"PSNR {score:.2f}")
+            if time.monotonic() > until:
+                break
+
+
+def require_all(subject: Subject, strategy: Strategy) -> None:
+    """Raises TimeUp where the minutes were spent before the last scene."""
+    writer = _writer(subject, strategy)
+    if missing := len(writer.pending()):
+        raise TimeUp(
+            f"minutes={subject.cfg.minutes} were spent after {len(writer.scenes) - missing} of {len(writer.scenes)} "
+            f"scenes of {strategy.name}; the same command goes on"
+        )
 
 
 def _shares(seconds: float, parts: Mapping[str, Sequence[float]], predicted: Sequence[Views]) -> dict[str, float]:

@@ -319,6 +319,16 @@ def test_a_phone_shows_it_all(phone):
     page.wait_for_function(f"{PLOT}.clientWidth < 390 && {PLOT}.querySelector('.main-svg').clientWidth < 390")
 
 
+def test_words_of_overrides_are_text_and_no_elements(open_page, tmp_path):
+    names = ("<img src=x>", "<b>bold</b>")
+    rows = [result(overrides=["strategy=ngd", f"run_name={name}"], run_id=name) for name in names]
+    page = open_page(chart(write_results(tmp_path, *rows, failed("slow", strategy=None))))
+    assert {text for text in page.locator("#table tbody td").all_inner_texts() if "<" in text} == set(names)
+    page.locator("#failed-strip button").click()
+    assert page.inner_text("#details h2") == "oom"
+    assert page.locator("#table img, #table b").count() == 0 and page.complaints == []
+
+
 def test_five_thousand_rows_stay_light(open_page, tmp_path):
     """What makes pages slow does not grow with the rows: elements, and points that are elements."""
     rng = np.random.default_rng(0)

@@ -59,7 +59,7 @@ function showFailure(entry) {
   const where = [entry.strategy, entry.seed === null ? null : `seed ${entry.seed}`, entry.device, entry.time].filter(Boolean).join(", ");
   const reason = element("p", { className: "bad" }, entry.error ?? "no reason was recorded");
   const note = element("p", { className: "note" }, where);
-  panelOf(`${entry.status}: ${entry.strategy}`, reason, note, commandOf(entry), overrideList(entry));
+  panelOf([entry.status, entry.strategy].filter(Boolean).join(": "), reason, note, commandOf(entry), overrideList(entry));
 }
 
 function drawFailures() {

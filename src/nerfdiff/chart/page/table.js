@@ -21,7 +21,8 @@ function columns() {
 }
 
 function cellOf(column) {
-  if (column.text) return (number) => column.text(number);
+  // what is shown is HTML, what is sorted and filtered is not
+  if (column.text) return (number, type) => (type === "display" ? DataTable.util.escapeHtml(String(column.text(number))) : column.text(number));
   return (number, type) => {
     const found = value(number, column.field);
     if (type === "sort" || type === "type") return found ? found[0] : null;

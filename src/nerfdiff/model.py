@@ -90,12 +90,6 @@ class NerfDiff(nn.Module):
             context=encoding.context,
         )
 
-    def denoise(
-        self, z: Float[Tensor, "batch 3 height width"], t: Tensor, condition: Condition
-    ) -> Float[Tensor, "batch 3 height width"]:
-        """x0 in [-1, 1] from Z_t; `t` may be a scalar."""
-        return self.denoiser(z, t.expand(z.shape[0]), condition)
-
     def parameter_count(self) -> dict[str, int]:
         """Parameters of each part and in all."""
         parts = {

@@ -5,6 +5,7 @@ from model_fixtures import config, input_cameras, look_at, model
 from nerfdiff.cameras import Cameras
 from nerfdiff.errors import ConfigError
 
+HALF = torch.full((2,), 0.5)  # t of two views
 VARIANTS = {
     "rendered": {"image": "rendered", "ray_maps": False, "cross_attention": True, "residual_std": None},
     "preconditioned": {"image": "rendered", "ray_maps": False, "cross_attention": True, "residual_std": 0.2},
@@ -38,9 +39,9 @@ def test_every_variant_sees_the_input_image_and_the_wanted_view(variant):
     net, noise = build(variant), torch.Generator().manual_seed(0)
     source, other = torch.rand(2, 1, 3, 16, 16, generator=noise)
     z = torch.randn(1, 3, 16, 16, generator=noise).expand(2, -1, -1, -1)
-    x0 = net.denoise(z, torch.tensor(0.5), condition_of(net, source))
+    x0 = net.denoiser(z, HALF, condition_of(net, source))
     assert not torch.allclose(x0[0], x0[1], atol=1e-5), "two views, one noise: only the camera differs"
-    changed = net.denoise(z, torch.tensor(0.5), condition_of(net, other))
+    changed = net.denoiser(z, HALF, condition_of(net, other))
     assert not torch.allclose(x0, changed, atol=1e-5)
 
 
@@ -49,7 +50,7 @@ def test_a_denoised_image_is_alpha_z_minus_sigma_v():
     condition = condition_of(net, torch.rand(1, 3, 16, 16))
     z, t = torch.randn(2, 3, 16, 16), torch.tensor([0.5, 1.0])
     v = net.denoiser.velocity(z, t, condition)
-    x0 = net.denoise(z, t, condition)
+    x0 = net.denoiser(z, t, condition)
     torch.testing.assert_close(x0[0], 0.5**0.5 * (z[0] - v[0]))
     torch.testing.assert_close(x0[1], -v[1])
 
@@ -59,12 +60,12 @@ def test_an_untrained_preconditioned_cdm_believes_the_rendering_where_all_is_noi
     condition = condition_of(net, torch.rand(1, 3, 16, 16))
     z = torch.randn(2, 3, 16, 16)
     rendered = 2 * condition.rendered - 1
-    torch.testing.assert_close(net.denoise(z, torch.tensor(1.0), condition), rendered)
+    torch.testing.assert_close(net.denoiser(z, torch.ones(2), condition), rendered)
     # and in between it is the posterior mean, in the form of a Kalman gain
     alpha = sigma = 0.5**0.5
     gain = 0.04 * alpha / (0.04 * alpha**2 + sigma**2)
     expected = rendered + gain * (z - alpha * rendered)
-    torch.testing.assert_close(net.denoise(z, torch.tensor(0.5), condition), expected)
+    torch.testing.assert_close(net.denoiser(z, HALF, condition), expected)
 
 
 def test_only_a_rendered_condition_can_be_built_upon():
@@ -81,7 +82,7 @@ def test_a_settled_encoding_conditions_as_the_encoding_itself(variant):
         wanted = Cameras(views().c2w.expand(2, 2, 4, 4), views().K.expand(2, 2, 3, 3), 16, 16)
         rendering, z = net.render(encoding, wanted), torch.randn(4, 3, 16, 16)
         plain, settled = (
-            net.denoise(z, torch.tensor(0.5), net.condition(known, wanted, rendering))
+            net.denoiser(z, torch.full((4,), 0.5), net.condition(known, wanted, rendering))
             for known in (encoding, net.settled(encoding))
         )
     torch.testing.assert_close(settled, plain, atol=1e-4, rtol=1e-4)

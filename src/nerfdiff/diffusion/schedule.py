@@ -46,19 +46,9 @@ def x0_from_v(z: Tensor, v: Tensor, alpha: Tensor, sigma: Tensor) -> Tensor:
     return alpha * z - sigma * v
 
 
-def eps_from_v(z: Tensor, v: Tensor, alpha: Tensor, sigma: Tensor) -> Tensor:
-    """ε = σ Z + α v: no division, so it holds at both ends."""
-    return sigma * z + alpha * v
-
-
 def eps_from_x0(z: Tensor, x0: Tensor, alpha: Tensor, sigma: Tensor) -> Tensor:
     """ε = (Z − α x0) / σ; undefined at t = 0, where Z holds no noise."""
     return (z - alpha * x0) / sigma
-
-
-def x0_from_eps(z: Tensor, eps: Tensor, alpha: Tensor, sigma: Tensor) -> Tensor:
-    """x0 = (Z − σ ε) / α; undefined at t = 1, where Z holds no signal."""
-    return (z - sigma * eps) / alpha
 
 
 def expand(coefficient: Float[Tensor, "batch"], like: Float[Tensor, "batch ..."]) -> Tensor:

@@ -55,7 +55,7 @@ def test_the_papers_numbers():
         ("trainer.max_steps=many", ["trainer.max_steps takes int", "'many'"]),
         ("trainer.max_steps=1.5", ["takes int"]),
         ("optimizer.lr=fast", ["optimizer.lr takes int or float"]),
-        ("channels_last=3", ["channels_last takes bool"]),
+        ("resume=3", ["resume takes bool"]),
         ("trainer.max_steps=true", ["takes int"]),
         ("trainer.max_steps=10,many", ["takes int", "'many'"]),
         ("a=[1,2", ["a=[1,2"]),

@@ -15,6 +15,7 @@ from nerfdiff.callbacks.checkpoint import ClearCheckpointIO
 from nerfdiff.checkpoint import check_resumable, export_model, last_checkpoint, load_model
 from nerfdiff.compilation import compile_unets
 from nerfdiff.data.datamodule import SceneDataModule
+from nerfdiff.diffusion.layout import channels_last
 from nerfdiff.diffusion.unet import AUTO
 from nerfdiff.errors import CheckpointError, ConfigError
 from nerfdiff.memory import WEIGHTS_ADAM_EMA, is_tight, within_memory
@@ -52,7 +53,7 @@ def train(cfg: DictConfig) -> dict[str, float]:
         losses=plain(cfg.losses),
         optimizer=plain(cfg.optimizer),
         validation_times=plain(cfg.validation_times),
-        channels_last=cfg.channels_last,
+        channels_last=channels_last(cfg.channels_last, trainer.strategy.root_device, cfg.compile != "none"),
         seed=cfg.seed,
     )
     module.model.renderer = replace(module.model.renderer, backend=cfg.backend, kernel_precision=cfg.kernel_precision)

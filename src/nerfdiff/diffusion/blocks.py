@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfdiff.diffusion.norm_silu import norm_silu
+from nerfdiff.diffusion.norm_silu import group_norm, norm_silu
 
 Features = Float[Tensor, "batch channels height width"]
 
@@ -77,7 +77,8 @@ class Attention(nn.Module):
 
     Pixels are rows and channels columns, as SDPA's fused kernels ask: the innermost axis must be dense, which a plain
     split of [batch, channels, height, width] does not give (PyTorch then falls back to the kernel that stores all
-    attention weights). In channels_last none of the steps from norm to output copies.
+    attention weights). In channels_last none of the steps from norm to output copies: on a GPU the fused norm keeps the
+    layout, on a CPU PyTorch's does.
     """
 
     def __init__(self, channels: int, head_channels: int, cross: bool):
@@ -98,7 +99,7 @@ class Attention(nn.Module):
             context: features, or what `keys_values` made of them.
         """
         batch, channels, height, width = x.shape
-        h = _rows(self.norm(x))
+        h = _rows(group_norm(self.norm, x))
         if self.norm_context is None:
             context = self._split_keys_values(h)
         elif not isinstance(context, KeyValue):
@@ -111,7 +112,7 @@ class Attention(nn.Module):
 
     def keys_values(self, context: Float[Tensor, "scenes channels _h _w"]) -> KeyValue:
         """What `forward` looks up in a context, without looking."""
-        return self._split_keys_values(_rows(self.norm_context(context)))
+        return self._split_keys_values(_rows(group_norm(self.norm_context, context)))
 
     def _split_keys_values(self, rows: Float[Tensor, "scenes pixels channels"]) -> KeyValue:
         return KeyValue(*(self._split(part) for part in _pointwise(self.key_value, rows).chunk(2, dim=-1)))

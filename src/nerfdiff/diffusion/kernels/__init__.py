@@ -1,1 +1,4 @@
-"""Device code of the U-Nets, in Triton. Files with `@triton.jit` hold nothing else: see nerfdiff.render.kernels."""
+"""GroupNorm, scale, shift and SiLU of the U-Nets in Triton; `function.fused_norm` is the way in.
+
+Files with `@triton.jit` hold nothing else: see nerfdiff.render.kernels.
+"""

@@ -41,11 +41,12 @@ def coefficients_kernel(
     x, sums, weight, bias, scale_shift, coefficients, pixels, parts, eps,
     MODULATED: tl.constexpr, GROUPS: tl.constexpr, SIZE: tl.constexpr, SP: tl.constexpr,
 ):  # fmt: skip
-    """a and b of each channel, so that norm, scale and shift together are a x + b.
+    """Of each channel: its group's mean and 1 / standard deviation, and a and b, so that norm, scale and shift together
+    are a (x − mean) + b.
 
     Args:
         scale_shift: [images, 2, C], where MODULATED.
-        coefficients: [images, 2, C] in fp32, out.
+        coefficients: [images, 4, C] in fp32, out.
     """
     image = tl.program_id(0).to(tl.int64)
     C = GROUPS * SIZE
@@ -60,34 +61,42 @@ def coefficients_kernel(
         first += tl.load(sums + part * 2 * C + channel, mask=known, other=0.0)
         second += tl.load(sums + part * 2 * C + C + channel, mask=known, other=0.0)
     count = 1.0 * SIZE * pixels
-    mean = tl.sum(tl.where(known, first + pixels * pivot, 0.0), 1) / count
-    away = tl.where(known, mean[:, None] - pivot, 0.0)
+    mean = (tl.sum(pivot, 1) / SIZE + tl.sum(first, 1) / count)[:, None]
+    away = tl.where(known, mean - pivot, 0.0)
     variance = tl.sum(second - 2 * away * first + pixels * away * away, 1) / count
-    inverse = 1 / tl.sqrt(tl.maximum(variance, 0.0) + eps)
-    a = tl.load(weight + channel, mask=known, other=0.0).to(tl.float32) * inverse[:, None]
-    b = tl.load(bias + channel, mask=known, other=0.0).to(tl.float32) - mean[:, None] * a
+    inverse = (1 / tl.sqrt(tl.maximum(variance, 0.0) + eps))[:, None]
+    a = tl.load(weight + channel, mask=known, other=0.0).to(tl.float32) * inverse
+    b = tl.load(bias + channel, mask=known, other=0.0).to(tl.float32)
     if MODULATED:
         scale_shift += image * 2 * C
         scale = 1 + tl.load(scale_shift + channel, mask=known, other=0.0).to(tl.float32)
         a *= scale
         b = b * scale + tl.load(scale_shift + C + channel, mask=known, other=0.0).to(tl.float32)
-    coefficients += image * 2 * C
-    tl.store(coefficients + channel, a, mask=known)
-    tl.store(coefficients + C + channel, b, mask=known)
+    coefficients += image * 4 * C
+    tl.store(coefficients + channel, tl.broadcast_to(mean, [GROUPS, SP]), mask=known)
+    tl.store(coefficients + C + channel, tl.broadcast_to(inverse, [GROUPS, SP]), mask=known)
+    tl.store(coefficients + 2 * C + channel, a, mask=known)
+    tl.store(coefficients + 3 * C + channel, b, mask=known)
 
 
 @triton.jit
 @no_type_check
-def apply_kernel(x, coefficients, out, pixels, C: tl.constexpr, CP: tl.constexpr, R: tl.constexpr):
-    """SiLU of a x + b, for R pixels per program."""
+def apply_kernel(
+    x, coefficients, out, pixels, ACTIVE: tl.constexpr, C: tl.constexpr, CP: tl.constexpr, R: tl.constexpr
+):
+    """a (x − mean) + b for R pixels per program, and where ACTIVE the SiLU of it."""
     image = tl.program_id(0).to(tl.int64)
     channel = tl.arange(0, CP)
     known = channel < C
-    coefficients += image * 2 * C
-    a = tl.load(coefficients + channel, mask=known, other=0.0)
-    b = tl.load(coefficients + C + channel, mask=known, other=0.0)
+    coefficients += image * 4 * C
+    mean = tl.load(coefficients + channel, mask=known, other=0.0)
+    a = tl.load(coefficients + 2 * C + channel, mask=known, other=0.0)
+    b = tl.load(coefficients + 3 * C + channel, mask=known, other=0.0)
     pixel = tl.program_id(1) * R + tl.arange(0, R)
     here = (pixel < pixels)[:, None] & known[None, :]
     at = image * pixels * C + pixel[:, None] * C + channel[None, :]
-    h = tl.load(x + at, mask=here, other=0.0).to(tl.float32) * a[None, :] + b[None, :]
-    tl.store(out + at, (h * tl.sigmoid(h)).to(out.dtype.element_ty), mask=here)
+    away = tl.load(x + at, mask=here, other=0.0).to(tl.float32) - mean[None, :]
+    h = a[None, :] * away + b[None, :]
+    if ACTIVE:
+        h = h * tl.sigmoid(h)
+    tl.store(out + at, h.to(out.dtype.element_ty), mask=here)

@@ -73,10 +73,11 @@ def test_costs_are_counted(data, run, tmp_path):
     assert none.depth_rmse is not None and none.mask_iou is not None
     assert none.params == cdm.params > 100_000
     assert none.scene_s["n"] == 1 and none.denoise_s is None
-    assert cdm.scene_s == cdm.distill_s and cdm.fit_s is None
+    rest = cdm.scene_s["median"] - cdm.distill_s["median"]
+    assert rest == pytest.approx(cdm.encode_s["median"]) and cdm.fit_s is None
     assert 0 < cdm.guide_s["median"] + cdm.denoise_s["median"] < cdm.distill_s["median"]
     assert (none.model, none.field, none.samples_per_ray) == ("tiny", "triplane", 8)
-    assert (none.backend, none.compile, none.scenes_at_once) == ("torch", False, 1)
+    assert (none.backend, none.compile, none.scenes_at_once) == ("cpu", False, 1)
     assert none.nonfinite_grad_steps == 0 and none.grad_norm_p99 > 0  # of the training run
     assert none.encode_s["n"] == none.render_s["n"] == cdm.encode_s["n"] == 1  # the first of two scenes warms up
     assert none.encode_s["median"] + 4 * none.render_s["median"] < none.scene_s["median"] and cdm.render_s is None
@@ -109,6 +110,18 @@ def test_the_same_evaluation_predicts_nothing_twice(data, run, tmp_path, monkeyp
     monkeypatch.setattr(SingleImageNeRF, "predict", never)
     again = evaluate(video)
     assert [row.psnr for row in again] == [row.psnr for row in first]
+
+
+def test_seconds_of_other_conditions_are_not_counted(data, run, tmp_path, monkeypatch):
+    """Numbers are of all scenes, whenever they were predicted; seconds of those predicted under the row's settings."""
+    settings = "orbit.scenes=0", "baselines=false"
+    (alone,) = evaluate(config(data, run, tmp_path, *settings))
+    (together,) = evaluate(config(data, run, tmp_path, *settings, "scenes_at_once=2"))
+    assert together.folder == alone.folder and together.psnr == alone.psnr
+    assert together.scene_s is together.render_s is together.peak_mem_bytes is None
+    assert together.config_sha256 != alone.config_sha256
+    (otherwise,) = evaluate(config(data, run, tmp_path, *settings, "backend=torch"))
+    assert otherwise.folder != alone.folder and otherwise.backend == "torch" and otherwise.scene_s["n"] == 1
 
 
 def test_a_killed_evaluation_goes_on_at_the_next_scene(data, run, tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ from nerfdiff.results.sweep_jobs import jobs_of
 from nerfdiff.sweeps import task as task_module
 from nerfdiff.sweeps.plan import read_plan
 from nerfdiff.sweeps.proposals import Grid, Random
-from nerfdiff.sweeps.run import Run
+from nerfdiff.sweeps.run import DEATHS, Run
 from nerfdiff.sweeps.space import Axis, Space
 from nerfdiff.sweeps.task import Task
 
@@ -113,14 +113,18 @@ def test_a_failure_that_nothing_took_note_of_is_told_at_the_end(tmp_path):
     assert launcher.ran == jobs(range(N))
 
 
-def test_a_job_that_takes_its_process_along_is_a_row_and_the_others_of_its_batch_run(tmp_path, monkeypatch):
+@pytest.mark.parametrize("deadly", [["x=1 seed=0"], jobs([0, 1])])
+def test_jobs_that_take_their_process_along_are_rows_and_the_others_of_their_batch_run(deadly, tmp_path, monkeypatch):
+    dying = []
+
     def dies(words):
-        if words[0] == "x=1" and words[-1] == "seed=0":
+        if f"{words[0]} {words[-1]}" in deadly:
+            dying[:] = words
             raise ChildProcessError("killed")
         return "ok"
 
     def record(config, error, subject, strategy):
-        words = ["x=1", "ckpt=demo", "seed=0"]
+        words = list(dying)
         append_row(tmp_path / "results.jsonl", ResultRow(run_id="x", overrides=words, status="error", error=str(error)))
 
     monkeypatch.setattr(measure, "record_failure", record)
@@ -131,8 +135,9 @@ def test_a_job_that_takes_its_process_along_is_a_row_and_the_others_of_its_batch
     run.load = lambda config, words: OmegaConf.create({"hydra": {"runtime": {}, "sweep": {"subdir": words[-1]}}})
     run()
     rows = read_rows(tmp_path / "results.jsonl")
-    assert Counter(row.status for row in rows) == {"ok": 2 * N - 1, "error": 1}
-    assert [row.error for row in rows if row.status == "error"] == ["killed"]
+    assert Counter(row.status for row in rows) == {"ok": 2 * N - len(deadly), "error": len(deadly)}
+    lost = {f"{row.overrides[0]} {row.overrides[-1]}": row.error for row in rows if row.status == "error"}
+    assert lost == dict.fromkeys(deadly, "killed")
 
 
 class Instance:
@@ -151,7 +156,7 @@ def test_a_launcher_that_never_works_ends_the_sweep(tmp_path, monkeypatch):
     monkeypatch.setattr(Run, "_record", lambda self, job, error: recorded.append(job))
     with pytest.raises(ModuleNotFoundError, match="no scheduler"):
         run()
-    assert len(recorded) < 3
+    assert len(recorded) == DEATHS
 
 
 def test_no_job_begins_when_the_minutes_are_spent(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """What predictions cost: the fields of a row, from what was written down of each scene."""
 
 from collections import Counter
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -8,6 +9,7 @@ import torch
 from nerfdiff.distill.strategy import Strategy
 from nerfdiff.evaluation.predict import costs
 from nerfdiff.evaluation.subject import Subject
+from nerfdiff.field import cpu_field
 from nerfdiff.render import backend
 from nerfdiff.results.row import Timing
 from nerfdiff.results.timing import cost_of_a_piece, summarise
@@ -28,15 +30,15 @@ def cost_fields(subject: Subject, strategy: Strategy) -> dict[str, Any]:
     }
     if fields["field_queries"] == 0:
         return fields
-    fields["scene_s"] = _timing(scenes, "seconds")
-    fields |= {f"{name}_s": _timing(scenes, name) for name in ("encode", "render")}
+    # a run that went on elsewhere, or with other threads, has numbers of all its scenes, and seconds of these
+    alike = [cost for cost in scenes if cost["conditions"] == subject.conditions]
+    fields["scene_s"] = _timing(alike, "seconds")
+    fields |= {f"{name}_s": _timing(alike, name) for name in ("encode", "render")}
     if fields["denoiser_calls"]:
-        fields["distill_s"] = fields["scene_s"]
-        fields |= {f"{name}_s": _timing(scenes, name) for name in PARTS}
-    pieces = sum(cost.get("pieces", 0) for cost in scenes)
-    fields["timing_s"] = cost_of_a_piece(subject.device) * pieces / len(scenes)
+        fields |= {f"{name}_s": _timing(alike, name) for name in ("distill", *PARTS)}
+    fields["timing_s"] = cost_of_a_piece(subject.device) * fmean(cost["pieces"] for cost in scenes)
     fields |= model_fields(subject) | {"backend": _backend(subject)}
-    fields["peak_mem_bytes"] = max(cost["peak_mem_bytes"] for cost in scenes)
+    fields["peak_mem_bytes"] = max((cost["peak_mem_bytes"] for cost in alike), default=None)
     fallen = Counter(cost["status"] for cost in scenes if cost["status"] != "ok")
     if fallen:
         fields["error"] = "fell back: " + ", ".join(f"{count} scenes {status}" for status, count in fallen.items())
@@ -65,11 +67,15 @@ def _timing(scenes: list[dict[str, Any]], name: str) -> Timing | None:
 
 @torch.no_grad()
 def _backend(subject: Subject) -> str:
-    """What renders, whatever was asked for."""
+    """What renders, whatever was asked for: `torch`, `triton`, or `cpu`, PyTorch in the order that suits a CPU."""
     model = subject.model
-    if model.renderer.backend == "torch" or (model.renderer.backend == "auto" and subject.device.type == "cpu"):
+    if model.renderer.backend == "torch":
         return "torch"
     scene = next(iter(subject.load(subject.scene_ids[:1]))).to(subject.device)
     with subject.autocast():
         field = model.field(model.encode(scene.source, scene.source_cameras, scene.near, scene.far))
-        return backend.chosen(model.renderer, field, scene.target_cameras[:, 0].rays(scene.near, scene.far))
+        rays = scene.target_cameras[:, 0].rays(scene.near, scene.far)
+    chosen = backend.chosen(model.renderer, field, rays)
+    if chosen == "torch" and model.renderer.backend == "auto" and cpu_field.suits(field, rays):
+        return "cpu"
+    return chosen

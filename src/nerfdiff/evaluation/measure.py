@@ -63,8 +63,8 @@ def record_failure(cfg: DictConfig, error: Exception, subject: Subject | None, s
 def _identified(subject: Subject, strategy: Strategy) -> ResultRow:
     """A row that says what was run, and of which nothing is measured yet."""
     cfg = subject.cfg
-    # What the numbers depend on: the identity of the predictions, the strategy and how it is scored.
-    config_hash = sha256_values([subject.identity, strategy.name, plain(cfg.metrics)])
+    # What the numbers depend on: the identity of the predictions and what they cost, the strategy, how it is scored.
+    config_hash = sha256_values([subject.identity, subject.conditions, strategy.name, plain(cfg.metrics)])
     prior = getattr(strategy, "prior", None)
     return ResultRow(
         run_id=f"{cfg.run_name}/{strategy.name}-{config_hash[:8]}",

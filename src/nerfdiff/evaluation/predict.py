@@ -93,7 +93,10 @@ def _shares(seconds: float, parts: Mapping[str, Sequence[float]], predicted: Seq
     spent = {"seconds": seconds, "pieces": sum(map(len, parts.values()))}
     spent |= {name: sum(pieces) for name, pieces in parts.items()}
     of = {"encode": len(parts.get("encode", ())), "render": sum(len(views.images) for views in predicted)}
-    return {name: value / of.get(name, len(predicted)) for name, value in spent.items()}
+    shares = {name: value / of.get(name, len(predicted)) for name, value in spent.items()}
+    # of the input image; what is encoded on the way, and rendered to be guided by, is part of the distillation
+    rest = shares.get("encode", 0.0) + spent.get("render", 0.0) / len(predicted)
+    return shares | {"distill": shares["seconds"] - rest}
 
 
 def _write(
@@ -114,6 +117,7 @@ def _write(
         opacity=views.opacity,
         cost={
             **spent,
+            "conditions": subject.conditions,
             "peak_mem_bytes": _peak_memory(subject.device),
             "denoiser_calls": views.denoiser_calls,
             "field_queries": views.field_queries,

@@ -14,8 +14,10 @@ from nerfdiff.checkpoint import LoadedModel, load_model
 from nerfdiff.compilation import compile_unets
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.datamodule import SceneDataModule
+from nerfdiff.diffusion.layout import channels_last
 from nerfdiff.errors import ConfigError
 from nerfdiff.model import NerfDiff
+from nerfdiff.results.environment import hardware
 from nerfdiff.results.hashes import sha256_file, sha256_values
 from nerfdiff.training import auto_precision, plain
 
@@ -32,6 +34,7 @@ class Subject:
         identity: what makes predictions comparable; other settings of it, other predictions.
         folder: of all that the run leaves.
         stability: of the model's training, see `LoadedModel`.
+        conditions: a digest of what does not change predictions but their cost: hardware, threads, scenes at once.
         data: where the scenes come from; None for a picture, whose other views nobody knows.
     """
 
@@ -44,6 +47,7 @@ class Subject:
     identity: dict[str, Any]
     folder: Path
     stability: Mapping[str, float | int | None]
+    conditions: str
     data: SceneDataModule | None
 
     @property
@@ -160,6 +164,8 @@ def _subject(
         "seed": cfg.seed,
         "precision": precision,
         "kernel_precision": cfg.kernel_precision,
+        "backend": cfg.backend,
+        "compile": cfg.compile,
         "samples": samples,
         "device": device.type,  # whose generators draw the noise
         "orbit": cfg.per_scene and cfg.orbit.frames,
@@ -174,10 +180,8 @@ def _subject(
         chunk=cfg.chunk or model.renderer.chunk,
         **samples,
     )
-    channels_last = cfg.channels_last
-    if channels_last is None:
-        channels_last = device.type == "cpu" or cfg.compile != "none"
-    if channels_last:
+    if channels_last(cfg.channels_last, device, cfg.compile != "none"):
         model.to(memory_format=torch.channels_last)
     compile_unets(model, cfg.compile, cfg.paths.compiled_dir)
-    return Subject(cfg, model, load, scene_ids, device, precision, identity, folder, loaded.stability, data)
+    conditions = sha256_values([hardware(device), cfg.threads, cfg.scenes_at_once])[:8]
+    return Subject(cfg, model, load, scene_ids, device, precision, identity, folder, loaded.stability, conditions, data)

@@ -55,7 +55,7 @@ class Prediction:
     pixels: UInt8[Tensor, "views 3 h w"]
     depth: Float[Tensor, "views h w"] | None
     opacity: Float[Tensor, "views h w"] | None
-    cost: dict[str, float]
+    cost: dict[str, Any]
     status: str
 
 
@@ -110,7 +110,7 @@ class PredictionWriter:
         source_views: Sequence[str] = (),
         depth: Float[Tensor, "views h w"] | None = None,
         opacity: Float[Tensor, "views h w"] | None = None,
-        cost: Mapping[str, float] | None = None,
+        cost: Mapping[str, Any] | None = None,
         status: str = "ok",
         beside: Callable[[Path], object] | None = None,
     ) -> Path:
@@ -119,7 +119,7 @@ class PredictionWriter:
         Args:
             images: colours, clamped to [0, 1] and rounded to 8 bit here.
             depth: along z in scene units (see `depth.z_depth`); needs `opacity`.
-            cost: seconds and counts of this scene, so that a resumed evaluation still knows them.
+            cost: seconds and counts of this scene, and under which conditions, so that a resumed evaluation still knows them.
             status: `ok`, or why the method fell back to something else.
             beside: writes further files into the scene's folder, which appears only when they are there too.
 

@@ -17,15 +17,19 @@ def environment(device: torch.device | str, precision: str | None = None) -> dic
         precision: the trainer's or the strategy's, e.g. "bf16-mixed".
     """
     device = torch.device(device)
-    return {
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
-        "cpu": cpu_name(),
+    return hardware(device) | {
         "torch": str(torch.__version__),
         "cuda": torch.version.cuda if device.type == "cuda" else None,
         "precision": precision,
         "lightning": version("lightning"),
         "hydra": version("hydra-core"),
     } | git_state(Path(__file__).parent)
+
+
+def hardware(device: torch.device) -> dict[str, str]:
+    """`device` and `cpu` of a `ResultRow`."""
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
+    return {"device": name, "cpu": cpu_name()}
 
 
 def cpu_name() -> str:

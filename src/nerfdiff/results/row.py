@@ -35,10 +35,12 @@ class ResultRow:
     `folder` is where predictions and scores lie, relative to the file of results. `command` makes the row again.
     Timings are dicts {n, median, iqr} in seconds, see `timing`: `encode_s` per image, `render_s` per view (of all
     predicted views of a scene in one call), the others per scene. `scene_s` is a scene from its input image to all its
-    predicted views, whatever the method; `distill_s` is the same of methods that call the denoiser, and `denoise_s`
-    (denoiser calls), `fit_s` (field updates) and `guide_s` (renderings of virtual views, which the denoiser sees and is
-    guided by) are parts of it; the rest is mostly encoding and rendering. `timing_s` are the seconds per scene that
-    measuring cost the run. `samples_per_ray` counts coarse and fine ones. `fid_n` is the number of images on either
+    predicted views, whatever the method; `distill_s` is that without encoding the image and rendering the views, of
+    methods that call the denoiser; `denoise_s` (denoiser calls), `fit_s` (field updates) and `guide_s` (renderings of
+    virtual views, which the denoiser sees and is guided by) are parts of it. `timing_s` are the seconds per scene that
+    measuring cost the run. `peak_mem_bytes` is what a GPU had allocated; on a CPU the process's resident set, with what
+    earlier jobs of a sweep left in it. `backend` is what rendered: `triton`, `torch`, or `cpu`, which is PyTorch in the
+    order that suits a CPU. `samples_per_ray` counts coarse and fine ones. `fid_n` is the number of images on either
     side of `fid` and `fd_st_vgg`; `n_views` counts all scored images; `consistency_n` scenes were measured for
     consistency. `fallbacks` counts the scenes whose distillation failed and which kept an earlier field; `error` says
     how; where all did, the status is `diverged`. The three after it are of the training run that made the checkpoint.

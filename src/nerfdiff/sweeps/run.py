@@ -22,8 +22,8 @@ from nerfdiff.sweeps.task import Task
 
 log = logging.getLogger(__name__)
 
-LAUNCHES = 3
-"""Launches in a row that end in an exception, without a job that ever came back, until the launcher is to blame."""
+DEATHS = 5
+"""Jobs that, each by itself, take their process along, while none ever came back, until the launcher is to blame."""
 
 Job = tuple[str, ...]
 """The overrides of a configuration and, where it is swept over, of a seed."""
@@ -136,11 +136,11 @@ class Run:
         try:
             results = self.launcher.launch([self._words(job) for job in batch], initial_job_idx=self.launched)
         except Exception as error:
-            self.deaths += 1
-            if self.deaths >= LAUNCHES and not self.launched:
-                raise
             if len(batch) == 1:
                 self._record(batch[0], error)
+                self.deaths += 1
+                if self.deaths >= DEATHS and not self.launched:
+                    raise
                 return []
             log.exception("the launcher failed; each job of this batch that left no row is run by itself")
             returns = []

@@ -1,6 +1,7 @@
 """Inner steps against a plain loop that knows nothing of batches, fused optimizers or recorded steps."""
 
 import copy
+from contextlib import contextmanager, nullcontext
 
 import pytest
 import torch
@@ -17,6 +18,7 @@ from nerfdiff.render.renderer import Renderer
 
 RENDERER = Renderer(4, 3, 1.0, 4096)
 SIZE, RAYS, STEPS = 16, 32, 5
+IMAGES = torch.rand(1, 2, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(2))
 
 
 def fields(scenes: int, device="cpu") -> RefinedField:
@@ -122,6 +124,67 @@ def test_no_step_is_no_loss_and_no_change():
 def test_one_ray_is_enough():
     losses = inner_steps(fields(1), torch.rand(1, 2, 3, SIZE, SIZE), rays=1).run(2)
     assert losses.shape == (2, 1) and bool(torch.isfinite(losses).all())
+
+
+def recording(monkeypatch, error: Exception | None = None, at_end: Exception | None = None):
+    """Inner steps on a CPU that take it for a GPU, and how their steps were recorded.
+
+    Args:
+        error: raised when the step to record starts.
+        at_end: raised because of it when recording ends.
+    """
+    inner, asked = inner_steps(fields(1), IMAGES), []
+    step = inner._step
+
+    class Graph:
+        replay = staticmethod(step)
+
+    def recorded_only():
+        if error is not None:
+            raise error
+
+    @contextmanager
+    def graph(_, **options):
+        asked.append(options)
+        monkeypatch.setattr(inner, "_step", recorded_only)
+        try:
+            yield
+        finally:
+            monkeypatch.setattr(inner, "_step", step)
+            if at_end is not None:
+                raise at_end
+
+    streams = type("Stream", (), {"wait_stream": lambda *_: None})
+    for name, value in {"CUDAGraph": Graph, "Stream": streams, "current_stream": streams}.items():
+        monkeypatch.setattr(torch.cuda, name, value)
+    monkeypatch.setattr(torch.cuda, "stream", lambda _: nullcontext())
+    monkeypatch.setattr(torch.cuda, "graph", graph)
+    monkeypatch.setattr(InnerSteps, "recording", True)
+    monkeypatch.setattr(inner, "_record", True)
+    return inner, asked
+
+
+def test_other_threads_may_allocate_while_a_step_is_recorded(monkeypatch):
+    inner, asked = recording(monkeypatch)
+    losses = inner.run(6)
+    assert asked == [{"capture_error_mode": "thread_local"}] and inner.recorded
+    torch.testing.assert_close(losses, inner_steps(fields(1), IMAGES).run(6))
+
+
+MEMORY, OTHER = torch.OutOfMemoryError("CUDA out of memory"), RuntimeError("operation not permitted")
+
+
+@pytest.mark.parametrize(
+    ("error", "at_end", "others_record"),
+    [(MEMORY, None, True), (MEMORY, RuntimeError("capture was invalidated"), True), (OTHER, None, False)],
+)
+def test_steps_that_cannot_be_recorded_are_taken(error, at_end, others_record, monkeypatch, caplog):
+    inner, asked = recording(monkeypatch, error, at_end)
+    for _ in range(2):
+        assert bool(torch.isfinite(inner.run(6)).all())
+    assert len(asked) == len(caplog.records) == 1 and not inner.recorded
+    assert str(at_end or error) in caplog.messages[0]
+    assert InnerSteps.recording is others_record
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")

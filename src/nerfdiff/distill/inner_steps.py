@@ -117,10 +117,18 @@ class InnerSteps:
         try:
             self.optimizer.zero_grad()
             # the inner context would not give the stream back where the end of recording fails
-            with torch.cuda.stream(torch.cuda.current_stream()), torch.cuda.graph(graph):
+            # other threads may go on allocating, as those that pin a loader's batches do
+            with (
+                torch.cuda.stream(torch.cuda.current_stream()),
+                torch.cuda.graph(graph, capture_error_mode="thread_local"),
+            ):
                 self._step()
         except RuntimeError as error:
-            log.warning("inner steps are not replayed from a CUDA graph: %s", str(error).splitlines()[0])
-            self._record = InnerSteps.recording = False
+            lines = str(error).splitlines()
+            log.warning("inner steps are not replayed from a CUDA graph: %s", lines[0] if lines else "no message")
+            self._record = False
+            # memory that ran out says nothing of the next scene; the end of recording may raise something of its own
+            if not any(isinstance(e, torch.OutOfMemoryError) for e in (error, error.__context__)):
+                InnerSteps.recording = False
             return
         self._graph = graph

@@ -1,19 +1,22 @@
 """Which renderer: the fused kernels where they can do the same as the PyTorch reference, else the reference."""
 
 import logging
+from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
+from operator import attrgetter
+from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerfdiff.cameras import Rays
 from nerfdiff.errors import ConfigError
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.field import FieldFn, TriplaneField
-from nerfdiff.field.triplane import Triplane
-from nerfdiff.render.agreement import disagreement
+from nerfdiff.render.agreement import Probe, disagreement, in_any_order
+from nerfdiff.render.reference_gradients import reference_gradients
 
 log = logging.getLogger(__name__)
 
@@ -66,17 +69,15 @@ def fused(
     """
     if not _wanted(renderer, field, rays):
         return None
-    reason = _obstacle(renderer, field, rays, jitter, coarse)
-    if reason is None:
-        try:
-            reason = _distrust(renderer, field, rays, jitter)
-            if reason is None:
-                return _render(renderer, field, rays, jitter, coarse, keep_coarse)
-        except torch.OutOfMemoryError:
-            raise
-        except Exception as error:
-            reason = _note_failure(_kind(renderer, field), "the forward pass", error, rays.near.device)
-    _tell(reason)
+    ordered = torch.are_deterministic_algorithms_enabled()
+    found = (
+        _obstacle(renderer, field, rays, jitter, coarse)
+        or _distrust(renderer, field, rays, jitter, coarse, ordered)
+        or _attempt(renderer, field, lambda: _render(renderer, field, rays, jitter, coarse, keep_coarse, ordered))
+    )
+    if not isinstance(found, str):
+        return found
+    _tell(found)
     return None
 
 
@@ -96,6 +97,16 @@ def _tell(reason: str) -> None:
     if reason not in _told:
         _told.add(reason)
         log.warning("no fused rendering, the PyTorch reference takes over: %s", reason)
+
+
+def _attempt(renderer, field: TriplaneField, kernels: Callable[[], Any]) -> Any:
+    """What kernels give; where they fail, why."""
+    try:
+        return kernels()
+    except torch.OutOfMemoryError:
+        raise
+    except Exception as error:
+        return _note_failure(_kind(renderer, field), "the forward pass", error, field.triplane.planes.device)
 
 
 def _note_failure(kind: tuple, what: str, error: Exception, device: torch.device) -> str:
@@ -212,30 +223,41 @@ def _regime(device: torch.device) -> str:
     return "tf32" if (torch.backends.fp32_precision if own == "none" else own) == "tf32" else "tf32x3"
 
 
-def _distrust(renderer, field: TriplaneField, rays: Rays, jitter: Tensor | None) -> str | None:
-    """Why kernels of this kind, about to be used for the first time, are not to be: they show something else."""
-    kind, with_gradients = _kind(renderer, field), torch.is_grad_enabled()
-    device = rays.near.device
+def _distrust(renderer, field: TriplaneField, rays: Rays, jitter, coarse, ordered: bool) -> str | None:
+    """Why kernels of this kind, about to be used for the first time, are not to be: they show something else.
+
+    Errors of the reference are raised, and not held against the kernels.
+    """
+    kind, needs, device = _kind(renderer, field), _needs(field, rays), rays.near.device
+    # what else kernels are compiled for
+    way = (*kind, ordered, renderer.importance_samples, jitter is None, coarse is None)
     recording = device.type == "cuda" and torch.cuda.is_current_stream_capturing()
-    if device.type not in _COMPARED or recording or {(*kind, True), (*kind, with_gradients)} & _trusted:
+    if device.type not in _COMPARED or recording or (*way, needs) in _trusted:
         return None
-    plain = replace(renderer, backend="torch")
-    reason = disagreement(
-        lambda *given: _render(renderer, *given, None, False)[0],
-        lambda *given: plain.render(*given).rgb,
-        field,
-        rays,
-        jitter,
-        with_gradients,
-    )
-    if reason is None:
-        _trusted.add((*kind, with_gradients))
-        return None
-    _failures[kind] = reason
-    return reason
+    plain, values = replace(renderer, backend="torch"), attrgetter("rgb", "opacity", "depth")
+    with in_any_order():
+        probe = Probe.like(field, rays, jitter, coarse, renderer.samples_per_ray, needs)
+        kernels = partial(probe.look, lambda *given: _render(renderer, *given, False, ordered)[:3])
+        found = _attempt(renderer, field, kernels)
+        if isinstance(found, str):
+            return found
+        expected = probe.look(lambda *given: values(plain.render(*given)))
+    # of a backward pass that failed, the reference's gradients were found
+    reason = _failures.get(kind) or disagreement(found, expected)
+    if reason is not None:
+        _failures[kind] = reason
+        return reason
+    _trusted.update({(*way, needs), (*way, (False, False, False))})
+    return None
 
 
-def _render(renderer, field: TriplaneField, rays: Rays, jitter, coarse, keep_coarse: bool) -> Outputs:
+def _needs(field: TriplaneField, rays: Rays) -> tuple[bool, ...]:
+    """Whether planes, decoder and rays get gradients."""
+    groups = [field.triplane.planes], field.decoder.parameters(), [rays.origins, rays.directions]
+    return tuple(torch.is_grad_enabled() and any(t.requires_grad for t in group) for group in groups)
+
+
+def _render(renderer, field: TriplaneField, rays: Rays, jitter, coarse, keep_coarse: bool, ordered: bool) -> Outputs:
     from nerfdiff.render.kernels.arguments import Settings
     from nerfdiff.render.kernels.function import fused_render
 
@@ -247,7 +269,7 @@ def _render(renderer, field: TriplaneField, rays: Rays, jitter, coarse, keep_coa
         points=_POINTS_PER_QUERY * renderer.chunk,
         ordered_points=renderer.chunk,
         precision=_precision(renderer, triplane.planes.device),
-        ordered=torch.are_deterministic_algorithms_enabled(),
+        ordered=ordered,
         image_width=triplane.cameras.width,
         image_height=triplane.cameras.height,
         density_shift=decoder.density_shift,
@@ -257,7 +279,7 @@ def _render(renderer, field: TriplaneField, rays: Rays, jitter, coarse, keep_coa
 
     def recover(error, tensors, d_outputs, needed):
         _tell(_note_failure(kind, "the backward pass", error, triplane.planes.device))
-        return _reference_gradients(renderer, field, settings.precision, tensors, d_outputs, needed)
+        return reference_gradients(renderer, field, settings.precision, tensors, d_outputs, needed)
 
     return fused_render(
         settings,
@@ -275,22 +297,3 @@ def _render(renderer, field: TriplaneField, rays: Rays, jitter, coarse, keep_coa
         jitter,
         coarse,
     )
-
-
-def _reference_gradients(renderer, field, precision, tensors, d_outputs, needed) -> list[Tensor | None]:
-    """The reference's gradients of the first 7 tensors, for a picture whose own backward pass failed."""
-    leaves = [tensor.detach().requires_grad_() for tensor in tensors[:7]]
-    planes, *parameters, origins, directions = leaves
-    _, near, far, ray_near, ray_far, jitter, coarse = tensors[7:]
-    decoder = Decoder(**field.decoder.settings)
-    for i, layer in enumerate((decoder.hidden, decoder.output)):
-        layer.weight, layer.bias = (nn.Parameter(value.detach()) for value in parameters[2 * i : 2 * i + 2])
-    leaves[1:5] = [decoder.hidden.weight, decoder.hidden.bias, decoder.output.weight, decoder.output.bias]
-    half = precision in ("bf16", "rounded")
-    with torch.enable_grad(), torch.autocast(planes.device.type, torch.bfloat16, enabled=half):
-        again = TriplaneField(Triplane(planes, field.triplane.cameras, near, far), decoder)
-        rays = Rays(origins, directions, ray_near, ray_far)
-        out = replace(renderer, backend="torch").render(again, rays, jitter, coarse)
-    wanted = [leaf for leaf, need in zip(leaves, needed, strict=True) if need]
-    found = iter(torch.autograd.grad((out.rgb, out.opacity, out.depth), wanted, d_outputs))
-    return [next(found) if need else None for need in needed]

@@ -3,8 +3,10 @@
     python benchmarks/all.py --minutes 10
     python benchmarks/all.py --minutes 25 --model base --compile --sweeps
 
-Tables are printed, files left in --out. A benchmark that takes longer than its share is stopped, and those after it
-still run. Objects are computed from a few diffusion steps, and their rows say so, unless --whole-objects is given.
+Tables are printed, files left in --out. A benchmark measures nothing new after most of its share of the time, and
+says what it left out; one that still takes longer is stopped, and those after it run. What such benchmarks had measured
+is in a file ….partial.json. Objects are computed from a few diffusion steps, and their rows say so, unless
+--whole-objects is given.
 """
 
 import argparse
@@ -27,6 +29,8 @@ SWEEPS = {
     "ngd_object": ("scenes",),
 }
 COMPILED = ("unet", "training_step", "ngd_object")
+MEASURING = 0.75
+"""Of a benchmark's time: the rest is for what runs when that is over."""
 CPU_RAYS = 512
 """Of a view, where a CPU renders it by pixel-aligned NeRFs."""
 
@@ -34,15 +38,17 @@ CPU_RAYS = 512
 def main(words: list[str] | None = None) -> int:
     arguments = _arguments(words)
     jobs = plan(arguments)
-    end = time.monotonic() + 60 * arguments.minutes
+    end = time.time() + 60 * arguments.minutes
     failed = []
     for number, (name, share, options) in enumerate(jobs):
-        left = max(1.0, end - time.monotonic())
+        left = max(1.0, end - time.time())
         # what others did not use is shared by those to come
         own = left * share / sum(later for _, later, _ in jobs[number:])
         print(f"\n=== {name} {' '.join(options)} (at most {own:.0f} s)", flush=True)
         try:
-            done = subprocess.run([sys.executable, str(Path(__file__).with_name(f"{name}.py")), *options], timeout=own)
+            script = str(Path(__file__).with_name(f"{name}.py"))
+            until = ["--until", f"{time.time() + MEASURING * own:.0f}"]
+            done = subprocess.run([sys.executable, script, *options, *until], timeout=own)
             problem = f"exit status {done.returncode}" if done.returncode else None
         except subprocess.TimeoutExpired:
             problem = f"stopped after {own:.0f} s"

@@ -22,7 +22,7 @@ from nerfdiff.data.batch import ViewBatch
 from nerfdiff.field.encoder import Encoding
 from nerfdiff.field.kinds import PIXELNERF, TRIPLANE, VISIONNERF
 from nerfdiff.render.renderer import Renderer
-from report import report
+from report import Report
 from subjects import Subject, scene, subject
 
 NAMES = {PIXELNERF: "pixelNeRF", VISIONNERF: "VisionNeRF"}
@@ -41,7 +41,6 @@ def main(words: list[str] | None = None) -> str:
     subjects = _subjects(arguments)
     first = next(iter(subjects.values()))
     limit = first.limits(arguments.seconds)
-    rows = _encoding(subjects, arguments.seconds) + _rendering(subjects, arguments.rays, arguments.seconds)
     samples = {s.model.renderer.samples_per_ray for s in subjects.values()}
     settings = {"pixels": first.size**2, "rays": arguments.rays or first.size**2, "samples": sorted(samples)}
     notes = [
@@ -49,7 +48,10 @@ def main(words: list[str] | None = None) -> str:
         "pixelNeRF and VisionNeRF render by two MLPs, at 64 + 96 and 64 + 128 points of a ray; here one, as a triplane",
         "paper: 128 pixels, a GPU that is not named",
     ]
-    return str(report("field_speed", first, rows, limit, settings, arguments.out, notes))
+    report = Report("field_speed", first, limit, settings, arguments.out, notes)
+    report.add(_encoding(subjects, arguments.seconds))
+    report.add(_rendering(subjects, arguments.rays, arguments.seconds))
+    return str(report.finish())
 
 
 def _subjects(arguments: argparse.Namespace) -> dict[str, Subject]:

@@ -9,6 +9,7 @@ import argparse
 import math
 import os
 import statistics
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -23,6 +24,28 @@ RESULTS = Path(os.environ.get("OUT") or Path(__file__).parent / "results")
 """Where files go that no --out sends elsewhere: into $OUT, where it is set."""
 SHORTEST = 5e-3
 """Seconds: quicker calls are timed several at once, so that starting and waiting for the device do not count."""
+NO_TIME = "no time left"
+"""Why a variant was not measured after the deadline."""
+
+
+class Deadline:
+    """From when on nothing new is measured: what is there by then is to be reported."""
+
+    def __init__(self):
+        self.end = math.inf
+
+    def set(self, end: str) -> float:
+        """Of Unix time, so that what a process takes to start counts."""
+        self.end = float(end)
+        return self.end
+
+    @property
+    def passed(self) -> bool:
+        return time.time() > self.end
+
+
+DEADLINE = Deadline()
+"""Of this process, set by --until."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +117,7 @@ def parser(description: str, model: str = "tiny", sweeps: Sequence[str] = ()) ->
     made.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, …")
     made.add_argument("--precision", choices=("auto", "32-true", "bf16-mixed"), default="auto")
     made.add_argument("--seconds", type=float, default=5.0, help="for each variant at each setting, about")
+    made.add_argument("--until", type=DEADLINE.set, metavar="UNIX_TIME", help="then report what is there")
     made.add_argument("--threads", type=int, help="CPU threads of PyTorch")
     made.add_argument("--out", type=Path, default=RESULTS, help="folder of the results")
     made.add_argument("overrides", nargs="*", help="of the training config, as model.render.chunk=65536")
@@ -113,13 +137,17 @@ def settings_of(
 
 
 def interleaved(variants: Mapping[str, Variant], device: torch.device, seconds: float) -> dict[str, Row]:
-    """Time variants in turn, after a warm-up, for about `seconds` each; one that fails, but for the first, says why."""
+    """Time variants in turn, after a warm-up, for about `seconds` each; one that fails, but for the first, says why,
+    and so does one whose turn comes after the deadline."""
     rows = {name: Row(name, {}) for name in variants}
     calls: dict[str, Callable[[], Any]] = {}
     repeats: dict[str, int] = {}
     for name, variant in variants.items():
         if isinstance(variant, Unavailable):
             rows[name].reason = variant.reason
+            continue
+        if DEADLINE.passed:
+            rows[name].reason = NO_TIME
             continue
         try:
             repeats[name] = _warm_up(variant, device, seconds)
@@ -130,7 +158,11 @@ def interleaved(variants: Mapping[str, Variant], device: torch.device, seconds: 
             rows[name].reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
     times: dict[str, list[float]] = {name: [] for name in calls}
     spent = 0.0
-    while calls and (spent < seconds * len(calls) or (len(next(iter(times.values()))) < 3 and spent < 3 * seconds)):
+    rounds = 0
+    while calls and (spent < seconds * len(calls) or (rounds < 3 and spent < 3 * seconds)):
+        if rounds and DEADLINE.passed:
+            break
+        rounds += 1
         for name, call in calls.items():
             elapsed = _timed(call, device, repeats[name])
             times[name].append(elapsed / repeats[name])
@@ -162,7 +194,13 @@ def _timed(call: Callable[[], Any], device: torch.device, repeats: int) -> float
 
 @lru_cache
 def limits(device: torch.device, dtype: torch.dtype, seconds: float) -> Limits:
-    """Measure the device, for about `seconds` twice."""
+    """Measure the device, for about `seconds` twice.
+
+    Raises:
+        SystemExit: there is no time left, and so nothing to report.
+    """
+    if DEADLINE.passed:
+        raise SystemExit(f"{NO_TIME} for any measurement")
     large = device.type == "cuda"
     source = torch.ones(2**28 if large else 2**24, device=device)
     target = torch.empty_like(source)

@@ -18,7 +18,7 @@ from nerfdiff.distill.inner_steps import InnerSteps
 from nerfdiff.distill.ray_batches import RayBatches
 from nerfdiff.render.renderer import Renderer
 from render import noise_field, with_samples
-from report import report
+from report import Report
 from subjects import Subject, scene, subject
 from variants import renderers
 
@@ -42,12 +42,12 @@ def main(words: list[str] | None = None) -> str:
         "views": arguments.views,
         "scenes": 1,
     }
-    rows: list[Row] = []
-    for setting in settings_of(arguments, usual, SWEEPS):
-        rows += _measure(measured, setting, arguments.steps, arguments.seconds)
     settings = usual | {"steps timed at once": arguments.steps}
     notes = ["times are of one step, those of a run divided by its steps, drawing and all"]
-    return str(report("inner_step", measured, rows, limit, settings, arguments.out, notes, arguments.sweep))
+    report = Report("inner_step", measured, limit, settings, arguments.out, notes, arguments.sweep)
+    for setting in settings_of(arguments, usual, SWEEPS):
+        report.add(_measure(measured, setting, arguments.steps, arguments.seconds))
+    return str(report.finish())
 
 
 def _measure(measured: Subject, setting: dict[str, int], steps: int, seconds: float) -> list[Row]:

@@ -1,15 +1,19 @@
 """One object distilled: encoded, conditions rendered, then at every step denoised, rendered and fitted.
 
-    python benchmarks/ngd_object.py --model base --budget paper --device cuda
-    python benchmarks/ngd_object.py --ckpt demo --budget minutes
-    python benchmarks/ngd_object.py --model base --budget paper --steps 2 --extrapolate
+    python benchmarks/ngd_object.py --model base --budget paper --compile --few --whole --seconds 1 --device cuda
+    python benchmarks/ngd_object.py --model base --budget paper --steps 4 --extrapolate --compile
+    python benchmarks/ngd_object.py --ckpt demo --budget minutes --with strategy.coarse=refresh budget.deep_every=2
 
-The reference is the plain renderer, eager U-Nets and no CUDA graph. The last command times objects of 1 and of 2
-diffusion steps and computes what all of them would take; its rows say so.
+The first command is for the goal of an object by model B in less than 6 s on one H100: it times all diffusion steps by
+the reference, by the fastest way that changes nothing, and by "fast". The reference is the plain renderer, eager U-Nets
+and no CUDA graph. "fast" does the same as the last way before it, with a distillation that --with changes; unless told
+otherwise, by coarse weights that are kept between refreshes. The second command times objects of 2 and of 4 diffusion
+steps and computes what all of them would take; its rows say so.
 """
 
+import argparse
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,14 +29,66 @@ from nerfdiff.distill.distillation import Distillation
 from nerfdiff.distill.inner_steps import InnerSteps
 from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.distill.virtual_views import VirtualViews
+from nerfdiff.errors import ConfigError
 from nerfdiff.model import NerfDiff
 from nerfdiff.training import plain
-from report import report
+from report import Report
 from subjects import Subject, scene, subject
 from variants import models, renderers
 
 SWEEPS = {"views": (5, 10, 25, 50, 100), "scenes": (1, 2, 4, 8)}
 STRATEGIES = ("ngd", "ngd_current", "direct", "sds", "stochastic")
+REFERENCE, FAST = "reference", "fast"
+FIT = "N inner steps"
+CHANGED = ("render K views", FIT)
+"""Parts in which kept coarse weights make a difference."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is done for an object.
+
+    Args:
+        strategy, budget: as configured.
+        steps: diffusion steps to time, at most.
+    """
+
+    strategy: dict[str, Any]
+    budget: dict[str, int]
+    steps: int | None
+
+    @staticmethod
+    def of(arguments: argparse.Namespace, changes: Sequence[str], views: int | None = None) -> "Plan":
+        """With these overrides of the distillation's config.
+
+        Raises:
+            ConfigError: an override names no key.
+        """
+        words = ["ckpt=none", "data=srn_cars", f"strategy={arguments.strategy}", f"budget={arguments.budget}", *changes]
+        cfg = load_config("distill", words + ([] if views is None else [f"budget.views={views}"]))
+        return Plan(plain(cfg.strategy), plain(cfg.budget), arguments.steps)
+
+    @property
+    def timed(self) -> int:
+        """Diffusion steps that are timed."""
+        return min(self.steps or self.budget["steps"], self.budget["steps"])
+
+    def method(self, steps: int) -> Distillation:
+        return instantiate(self.strategy | {"teacher": self.strategy["teacher"] | {"steps": steps}})
+
+    @property
+    def keeps_coarse(self) -> bool:
+        """Whether inner steps draw from weights that rendering for the teacher found."""
+        return self.strategy["coarse"] == "refresh" and self.method(1).teacher.func.follows_field
+
+    def warning(self, extrapolate: bool) -> str | None:
+        """Where not all steps are timed."""
+        every = self.budget["steps"]
+        if self.timed == every:
+            return None
+        if extrapolate:
+            return f"EXTRAPOLATED: objects are computed from {self.timed} of {every} diffusion steps"
+        return f"PARTIAL: objects are of {self.timed} diffusion steps, where the budget has {every}"
 
 
 @dataclass(frozen=True)
@@ -41,107 +97,111 @@ class Way:
 
     model: NerfDiff
     cuda_graphs: bool
+    plan: Plan
 
 
 def main(words: list[str] | None = None) -> str:
     arguments = _arguments(words)
     measured = subject(arguments)
+    exact, fast = Plan.of(arguments, ()), Plan.of(arguments, arguments.fast)
+    if fast.budget["views"] != exact.budget["views"]:
+        raise ConfigError("--with budget.views=…: all ways have the same views; take --sweep views --values …")
+    every = fast.budget["deep_every"]
+    if arguments.extrapolate and fast.timed < fast.budget["steps"] and (fast.timed % 2 or fast.timed // 2 % every):
+        raise ConfigError(f"--extrapolate with budget.deep_every={every}: --steps must be a multiple of {2 * every}")
+    usual = {"views": exact.budget["views"], "scenes": arguments.scenes}
+    settings = {"strategy": arguments.strategy, "budget": arguments.budget} | exact.budget | usual
+    settings |= {"steps timed": exact.timed, FAST: " ".join(arguments.fast)}
+    settings |= {"overrides": " ".join(arguments.overrides)} if arguments.overrides else {}
+    warnings = dict.fromkeys(plan.warning(arguments.extrapolate) for plan in (exact, fast))
+    notes = [warning for warning in warnings if warning]
+    notes.append(f"{FAST}: as the way before it, with {settings[FAST]}")
     limit = measured.limits(arguments.seconds)
-    budget = plain(_config(arguments, {}).budget)
-    usual = {"views": budget["views"], "scenes": arguments.scenes}
-    rows: list[Row] = []
+    report = Report("ngd_object", measured, limit, settings, arguments.out, notes, arguments.sweep)
     for setting in settings_of(arguments, usual, SWEEPS):
-        rows += _measure(arguments, measured, budget, setting)
-    timed = arguments.steps or budget["steps"]
-    settings = {"strategy": arguments.strategy, "budget": arguments.budget} | budget | usual | {"steps timed": timed}
-    notes = []
-    if timed < budget["steps"]:
-        notes.append(
-            f"EXTRAPOLATED: objects are computed from {timed} of {budget['steps']} diffusion steps"
-            if arguments.extrapolate
-            else f"PARTIAL: objects are of {timed} diffusion steps, where the budget has {budget['steps']}"
-        )
-    return str(report("ngd_object", measured, rows, limit, settings, arguments.out, notes, arguments.sweep))
+        _measure(arguments, measured, setting, report)
+    return str(report.finish())
 
 
-def _config(arguments, setting: dict[str, int]):
-    views = [f"budget.views={setting['views']}"] if setting else []
-    words = ["ckpt=none", "data=srn_cars", f"strategy={arguments.strategy}", f"budget={arguments.budget}", *views]
-    return load_config("distill", words)
-
-
-def _measure(arguments, measured: Subject, budget: dict[str, int], setting: dict[str, int]) -> list[Row]:
-    steps = min(arguments.steps or budget["steps"], budget["steps"])
-    method = _method(arguments, setting, steps)
+def _measure(arguments: argparse.Namespace, measured: Subject, setting: dict[str, int], report: Report) -> None:
     scenes = [scene(measured, 1, seed=number) for number in range(setting["scenes"])]
-    ways = _ways(measured, arguments.compile)
-    rows: list[Row] = []
-    if not arguments.whole:
-        rows += _parts(measured, ways, method, scenes, budget, setting, arguments.seconds)
-    found = _objects(measured, ways, method, scenes, arguments.seconds)
-    for row in found.values():
-        row.work = _work(measured, budget, setting, steps)
-    if arguments.extrapolate and steps < budget["steps"]:
-        fewer = steps // 2
-        short = _objects(measured, ways, _method(arguments, setting, fewer), scenes, arguments.seconds)
-        ran = {name: row for name, row in found.items() if row.seconds and short[name].seconds}
-        for name, row in ran.items():
-            medians = {fewer: short[name].seconds["median"], steps: row.seconds["median"]}
-            row.seconds["median"] = extrapolated(medians, budget["steps"])
-            row.seconds["iqr"] *= budget["steps"] / steps
-            row.work = _work(measured, budget, setting, budget["steps"])
-            row.more["extrapolated from steps"] = steps
-            row.ratio = next(iter(ran.values())).seconds["median"] / row.seconds["median"]
+    ways = _ways(arguments, measured, setting["views"])
+    seconds = arguments.seconds
+    for variants in [] if arguments.whole else _parts(measured, ways, scenes, setting, seconds):
+        report.add(variants)
+    timed = {name: way.plan.timed for name, way in ways.items() if isinstance(way, Way)}
+    found = _objects(measured, ways, timed, scenes, seconds)
+    ran = {name: row for name, row in found.items() if row.seconds}
+    fewer = {name: timed[name] // 2 for name in ran if timed[name] < ways[name].plan.budget["steps"]}
+    if arguments.extrapolate and fewer:
+        short = _objects(measured, {name: ways[name] for name in fewer}, fewer, scenes, seconds)
+        reference = found[REFERENCE]
+        for name, steps in fewer.items():
+            row, every = ran[name], ways[name].plan.budget["steps"]
+            if short[name].seconds is None:
+                row.seconds, row.ratio, row.reason = None, None, short[name].reason
+                del ran[name]
+                continue
+            medians = {steps: short[name].seconds["median"], timed[name]: row.seconds["median"]}
+            row.seconds |= {"median": extrapolated(medians, every), "iqr": row.seconds["iqr"] * every / timed[name]}
+            row.more["extrapolated from steps"] = timed[name]
+            timed[name] = every
+        for row in ran.values():
+            row.ratio = reference.seconds and reference.seconds["median"] / row.seconds["median"]
     for name, row in found.items():
         row.name = f"{setting['scenes']} objects, {name}" if setting["scenes"] > 1 else f"object, {name}"
-        if row.seconds is not None:
-            row.more["s/object"] = row.seconds["median"] / setting["scenes"]
-            row.more["objects/min"] = 60 * setting["scenes"] / row.seconds["median"]
-    rows += found.values()
-    for row in rows:
         row.setting = setting
-    return rows
+    for name, row in ran.items():
+        row.work = _work(measured, ways[name].plan.budget, setting, timed[name])
+        row.more["s/object"] = row.seconds["median"] / setting["scenes"]
+        row.more["objects/min"] = 60 * setting["scenes"] / row.seconds["median"]
+    report.add(list(found.values()))
 
 
 def extrapolated(seconds: dict[int, float], steps: int) -> float:
     """Seconds of `steps` steps on the line through two measurements {steps: seconds}: what is done once per object,
-    setting up the loop included, is not multiplied."""
+    setting up the loop included, is not multiplied. Where fewer steps took no less, which is chance, all is."""
     (few, short), (more, long) = sorted(seconds.items())
-    return short + (long - short) / (more - few) * (steps - few)
+    each = (long - short) / (more - few) if long > short else long / more
+    return long + each * (steps - more)
 
 
-def _method(arguments, setting: dict[str, int], steps: int) -> Distillation:
-    strategy = plain(_config(arguments, setting).strategy)
-    strategy["teacher"]["steps"] = steps
-    return instantiate(strategy)
-
-
-def _objects(measured: Subject, ways, method: Distillation, scenes: Sequence[ViewBatch], seconds: float):
+def _objects(
+    measured: Subject,
+    ways: dict[str, Way | Unavailable],
+    steps: dict[str, int],
+    scenes: Sequence[ViewBatch],
+    seconds: float,
+) -> dict[str, Row]:
     calls = {
-        name: way if isinstance(way, Unavailable) else _distils(measured, way, method, scenes)
+        name: way if isinstance(way, Unavailable) else _distils(measured, way, steps[name], scenes)
         for name, way in ways.items()
     }
     return interleaved(calls, measured.device, seconds)
 
 
-def _ways(measured: Subject, compiled: bool) -> dict[str, Way | Unavailable]:
-    """Every renderer with every kind of U-Net; only the reference records no CUDA graph."""
+def _ways(arguments: argparse.Namespace, measured: Subject, views: int) -> dict[str, Way | Unavailable]:
+    """Every renderer with every kind of U-Net, and the last of them made faster; only the reference records no CUDA
+    graph."""
+    exact, fast = Plan.of(arguments, (), views), Plan.of(arguments, arguments.fast, views)
     backends = renderers(measured.model, measured.model.renderer)
     ways: dict[str, Way | Unavailable] = {}
-    for unets, model in models(measured.model.requires_grad_(False), compiled).items():
+    for unets, model in models(measured.model.requires_grad_(False), arguments.compile).items():
         for name, renderer in backends.items():
-            reference = not ways
             if isinstance(renderer, Unavailable):
                 ways[f"{name}, {unets}"] = renderer
                 continue
             own = copy.copy(model)  # of the module alone: its parts, and so its weights, are shared
             own.renderer = renderer
-            ways["reference" if reference else f"{name}, {unets}"] = Way(own, not reference)
-    return ways
+            last = f"{name}, {unets}" if ways else REFERENCE
+            ways[last] = Way(own, last != REFERENCE, exact)
+    if arguments.few:
+        ways = {name: ways[name] for name in (REFERENCE, last)}
+    return ways | {FAST: replace(ways[last], plan=fast)}
 
 
-def _distils(measured: Subject, way: Way, method: Distillation, scenes: Sequence[ViewBatch]):
-    own = replace(method, cuda_graphs=way.cuda_graphs)
+def _distils(measured: Subject, way: Way, steps: int, scenes: Sequence[ViewBatch]):
+    own = replace(way.plan.method(steps), cuda_graphs=way.cuda_graphs)
 
     def call():
         with measured.autocast():
@@ -155,39 +215,44 @@ def _distils(measured: Subject, way: Way, method: Distillation, scenes: Sequence
 def _parts(
     measured: Subject,
     ways: dict[str, Way | Unavailable],
-    method: Distillation,
     scenes: Sequence[ViewBatch],
-    budget: dict[str, int],
     setting: dict[str, int],
     seconds: float,
-) -> list[Row]:
+) -> Iterator[list[Row]]:
     """What an object consists of, each by itself: of one scene, but for what scenes do together."""
     dtype, config, size = measured.dtype, measured.config, measured.size
-    pixels, renderer = setting["views"] * size**2, measured.model.renderer
-    views_rendered = costs.rendering(renderer, config, size, pixels, 1, backward=False)
-    inner = costs.rendering(renderer, config, size, budget["rays"], setting["scenes"], backward=True)
+    views_rendered = costs.rendering(measured.model.renderer, config, size, setting["views"] * size**2, 1, False)
     works = {
         "encode": costs.encoding(config, size, dtype),
         "conditions": views_rendered,
         "denoise K views": costs.denoising(config, size, setting["views"], dtype),
         "render K views": views_rendered,
-        "N inner steps": Work(inner.flops * budget["inner_steps"], inner.bytes * budget["inner_steps"]),
     }
-    calls: dict[str, dict[str, Any]] = {part: {} for part in works}
+    calls: dict[str, dict[str, Any]] = {part: {} for part in (*works, FIT)}
     for name, way in ways.items():
-        pieces = {} if isinstance(way, Unavailable) else _pieces(measured, way, method, scenes[0], budget, setting)
-        for part in works:
-            calls[part][name] = pieces.get(part, way)
-    rows = []
+        pieces = (
+            dict.fromkeys(calls, way) if isinstance(way, Unavailable) else _pieces(measured, way, scenes[0], setting)
+        )
+        for part in CHANGED if name == FAST else calls:
+            calls[part][name] = pieces[part]
     for part, variants in calls.items():
-        found = interleaved(variants, measured.device, seconds)
-        for name, row in found.items():
-            row.name, row.work = f"{part}, {name}", works[part]
-        rows += found.values()
-    return rows
+        rows = interleaved(variants, measured.device, seconds)
+        for name, row in rows.items():
+            row.name, row.setting = f"{part}, {name}", setting
+            if row.seconds is not None:
+                row.work = works.get(part) or _fitting(measured, ways[name].plan.budget, setting["scenes"])
+        yield list(rows.values())
 
 
-def _pieces(measured: Subject, way: Way, method: Distillation, one: ViewBatch, budget, setting) -> dict[str, Any]:
+def _fitting(measured: Subject, budget: dict[str, int], scenes: int) -> Work:
+    """Of N inner steps."""
+    renderer, size = measured.model.renderer, measured.size
+    one = costs.rendering(renderer, measured.config, size, budget["rays"], scenes, backward=True)
+    return Work(one.flops * budget["inner_steps"], one.bytes * budget["inner_steps"])
+
+
+def _pieces(measured: Subject, way: Way, one: ViewBatch, setting: dict[str, int]) -> dict[str, Any]:
+    method, budget, keep = way.plan.method(1), way.plan.budget, way.plan.keeps_coarse
     model, cameras = way.model, method.prior(one)
 
     def encode():
@@ -210,7 +275,7 @@ def _pieces(measured: Subject, way: Way, method: Distillation, one: ViewBatch, b
 
     def render():
         with torch.no_grad(), measured.autocast():
-            field.render(model.renderer, cameras)
+            field.render(model.renderer, cameras, keep_coarse=keep)
 
     shape = {"rays": budget["rays"], "plane": measured.size} | setting
     return {
@@ -218,22 +283,24 @@ def _pieces(measured: Subject, way: Way, method: Distillation, one: ViewBatch, b
         "conditions": conditions,
         "denoise K views": denoise,
         "render K views": render,
-        "N inner steps": steps_of(measured, model.renderer, shape, budget["inner_steps"], way.cuda_graphs),
+        FIT: steps_of(measured, model.renderer, shape, budget["inner_steps"], way.cuda_graphs, keep),
     }
 
 
-def _work(measured: Subject, budget: dict[str, int], setting: dict[str, int], steps: int) -> Work:
-    """Of NGD on all scenes: encoding, conditions, and at every step denoising, rendering and N inner steps."""
+def _work(measured: Subject, budget: dict[str, int], setting: dict[str, int], steps: int) -> Work | None:
+    """Of NGD on all scenes: encoding, conditions, and at every step denoising, rendering and N inner steps. None where
+    not all of the CDM is computed."""
+    if budget["deep_every"] > 1:
+        return None
     config, size, renderer = measured.config, measured.size, measured.model.renderer
     encoding = costs.encoding(config, size, measured.dtype)
     shown = costs.rendering(renderer, config, size, setting["views"] * size**2, 1, backward=False)
     denoised = costs.denoising(config, size, setting["views"], measured.dtype)
-    fitted = costs.rendering(renderer, config, size, budget["rays"], 1, backward=True)
+    fitted = _fitting(measured, budget, 1)
 
     def total(name: str) -> float:
         once = getattr(encoding, name) + getattr(shown, name)
-        inner = budget["inner_steps"] * getattr(fitted, name)
-        each = getattr(denoised, name) + getattr(shown, name) + inner
+        each = getattr(denoised, name) + getattr(shown, name) + getattr(fitted, name)
         return setting["scenes"] * (once + steps * each)
 
     return Work(total("flops"), total("bytes"))
@@ -247,6 +314,15 @@ def _arguments(words):
     made.add_argument("--steps", type=int, help="diffusion steps to time; default: all of the budget")
     made.add_argument("--extrapolate", action="store_true", help="from --steps to all of the budget's, and say so")
     made.add_argument("--whole", action="store_true", help="objects only, not their parts")
+    made.add_argument("--few", action="store_true", help=f"{REFERENCE}, the last way and {FAST} only")
+    made.add_argument(
+        "--with",
+        dest="fast",
+        nargs="+",
+        default=["strategy.coarse=refresh"],
+        metavar="KEY=VALUE",
+        help=f"of the distillation's config, what {FAST} changes; default: strategy.coarse=refresh",
+    )
     made.add_argument(
         "--compile", action="store_true", help="also with compiled U-Nets; the first call takes up to minutes"
     )

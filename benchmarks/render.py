@@ -17,7 +17,7 @@ from nerfdiff.distill.ray_batches import RayBatches
 from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.render.renderer import Renderer
-from report import report
+from report import Report
 from subjects import Subject, scene, subject
 from variants import renderers
 
@@ -39,12 +39,12 @@ def main(words: list[str] | None = None) -> str:
         "plane": measured.size,
         "scenes": 1,
     }
-    rows: list[Row] = []
+    notes = ["FLOP of the gathers and the decoder, without recomputing; MB is the least that must move"]
+    report = Report("render", measured, limit, usual, arguments.out, notes, arguments.sweep)
     for setting in settings_of(arguments, usual, SWEEPS):
         for backward in (False, True):
-            rows += _measure(measured, setting, backward, arguments.seconds)
-    notes = ["FLOP of the gathers and the decoder, without recomputing; MB is the least that must move"]
-    return str(report("render", measured, rows, limit, usual, arguments.out, notes, arguments.sweep))
+            report.add(_measure(measured, setting, backward, arguments.seconds))
+    return str(report.finish())
 
 
 def _measure(measured: Subject, setting: dict[str, int], backward: bool, seconds: float) -> list[Row]:

@@ -14,54 +14,77 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from harness import Limits, Row
+from harness import NO_TIME, Limits, Row
 from nerfdiff.results.environment import environment
 from nerfdiff.results.files import atomic, write_text
 
 
-def report(
-    benchmark: str,
-    subject: Any,
-    rows: Sequence[Row],
-    limit: Limits,
-    settings: Mapping[str, Any],
-    out: Path,
-    notes: Sequence[str] = (),
-    sweep: str | None = None,
-) -> Path:
-    """Print the table, write it as JSON (and a sweep as a picture), and return the JSON's path.
+class Report:
+    """A table that grows: whatever stops a benchmark, the groups of variants measured by then are in its file.
+
+    Until all is measured, that is a file ….partial.json, which says `"complete": false`.
 
     Args:
         subject: a `subjects.Subject`.
         settings: what the rows have in common.
         notes: what a reader must know to read the numbers.
     """
-    facts = environment(subject.device, subject.precision)
-    hardware = facts["device"] if subject.device.type == "cuda" else facts["cpu"]
-    now = datetime.now(UTC)
-    name = benchmark if sweep is None else f"{benchmark}-{sweep}"
-    path = out / f"{name}-{slug(subject.name)}-{slug(hardware)}-{now:%Y-%m-%d}.json"
-    content = {
-        "benchmark": benchmark,
-        "sweep": sweep,
-        "time": now.isoformat(timespec="seconds"),
-        "model": subject.name,
-        "parameters": subject.model.parameter_count(),
-        "image_size": [subject.size, subject.size],
-        "settings": dict(settings),
-        "hardware": hardware,
-        "environment": facts | {"threads": torch.get_num_threads(), "cores": os.cpu_count()},
-        "limits": asdict(limit),
-        "notes": list(notes),
-        "rows": [asdict(row) | _rates(row, limit) for row in rows],
-    }
-    write_text(path, json.dumps(content, indent=1) + "\n")
-    title = f"{name}: {subject.name}, {subject.size} pixels, {subject.precision}, on {hardware}"
-    _print(title, rows, limit, settings, notes)
-    if sweep is not None:
-        _plot(path.with_suffix(".png"), title, sweep, rows)
-    print(path)
-    return path
+
+    def __init__(
+        self,
+        benchmark: str,
+        subject: Any,
+        limit: Limits,
+        settings: Mapping[str, Any],
+        out: Path,
+        notes: Sequence[str] = (),
+        sweep: str | None = None,
+    ):
+        self.subject, self.limit, self.sweep = subject, limit, sweep
+        self.rows: list[Row] = []
+        self.settings, self.notes = dict(settings), list(notes)
+        facts = environment(subject.device, subject.precision)
+        hardware = facts["device"] if subject.device.type == "cuda" else facts["cpu"]
+        now = datetime.now(UTC)
+        self.name = benchmark if sweep is None else f"{benchmark}-{sweep}"
+        self.title = f"{self.name}: {subject.name}, {subject.size} pixels, {subject.precision}, on {hardware}"
+        self.path = out / f"{self.name}-{slug(subject.name)}-{slug(hardware)}-{now:%Y-%m-%d}.json"
+        self._partial = self.path.with_suffix(".partial.json")
+        self._facts = {
+            "benchmark": benchmark,
+            "sweep": sweep,
+            "time": now.isoformat(timespec="seconds"),
+            "model": subject.name,
+            "parameters": subject.model.parameter_count(),
+            "image_size": [subject.size, subject.size],
+            "hardware": hardware,
+            "environment": facts | {"threads": torch.get_num_threads(), "cores": os.cpu_count()},
+            "limits": asdict(limit),
+        }
+
+    def add(self, rows: Sequence[Row]) -> None:
+        """Write what was measured up to here."""
+        self.rows += rows
+        self._write(self._partial, complete=False)
+        print(f"{len(self.rows)} rows so far: {self._partial}", flush=True)
+
+    def finish(self) -> Path:
+        """Print the table, write it as JSON (and a sweep as a picture), and return the JSON's path."""
+        complete = all(row.reason != NO_TIME for row in self.rows)
+        path = self.path if complete else self._partial
+        self._write(path, complete)
+        if complete:
+            self._partial.unlink(missing_ok=True)
+        _print(self.title, self.rows, self.limit, self.settings, self.notes)
+        if self.sweep is not None:
+            _plot(path.with_suffix(".png"), self.title, self.sweep, self.rows)
+        print(path)
+        return path
+
+    def _write(self, path: Path, complete: bool) -> None:
+        rows = [asdict(row) | _rates(row, self.limit) for row in self.rows]
+        measured = {"settings": self.settings, "notes": self.notes, "complete": complete, "rows": rows}
+        write_text(path, json.dumps(self._facts | measured, indent=1) + "\n")
 
 
 def slug(text: str) -> str:
@@ -131,9 +154,10 @@ def _plot(path: Path, title: str, sweep: str, rows: Sequence[Row]) -> None:
     """Seconds over the swept value, one line per variant; dashed is what proportional cost would be."""
     from matplotlib.figure import Figure  # not pyplot: no global state, and no display
 
-    figure = Figure(figsize=(6, 4), layout="constrained")
+    names = dict.fromkeys(row.name for row in rows)
+    figure = Figure(figsize=(6, max(4, 0.25 * len(names))), layout="constrained")  # a line of the legend for each
     axes = figure.subplots()
-    for name in dict.fromkeys(row.name for row in rows):
+    for name in names:
         points = [(row.setting[sweep], row.seconds) for row in rows if row.name == name and row.seconds]
         if points:
             values, seconds = zip(*points, strict=True)

@@ -18,13 +18,14 @@ import costs
 from harness import Row, Unavailable, Variant, interleaved, parser, settings_of
 from nerfdiff.cli import load_config
 from nerfdiff.data.batch import ViewBatch
+from nerfdiff.diffusion.layout import channels_last
 from nerfdiff.diffusion.unet import AUTO
 from nerfdiff.memory import largest_batch, within_memory
 from nerfdiff.model import NerfDiff
 from nerfdiff.modules.nerfdiff_module import NerfDiffModule
 from nerfdiff.render.renderer import Renderer
 from nerfdiff.training import plain
-from report import report
+from report import Report
 from subjects import Subject, scene, subject
 from variants import as_kind, kinds, renderers
 
@@ -49,16 +50,16 @@ def main(words: list[str] | None = None) -> str:
     usual = {"batch": arguments.batch or cfg.data.batch_size}
     measured = _settled(subject(arguments), cfg, usual["batch"])
     limit = measured.limits(arguments.seconds)
-    rows: list[Row] = []
-    for setting in settings_of(arguments, usual, SWEEPS):
-        rows += _measure(measured, cfg, setting["batch"], arguments.compile, arguments.seconds)
     settings = usual | {"targets": cfg.data.target_views, "checkpointing": measured.config["unet"]["checkpointing"]}
     notes = ["FLOP without what is recomputed: the share of the matrix rate is the model's, not the device's, work"]
+    report = Report("training_step", measured, limit, settings, arguments.out, notes, arguments.sweep)
+    for setting in settings_of(arguments, usual, SWEEPS):
+        report.add(_measure(measured, cfg, setting["batch"], arguments.compile, arguments.seconds))
     if arguments.memory is not None:
         found = largest_batches(measured, cfg, arguments.memory)
-        settings |= found
-        notes += [f"{name}: {batch}" for name, batch in found.items()]
-    return str(report("training_step", measured, rows, limit, settings, arguments.out, notes, arguments.sweep))
+        report.settings |= found
+        report.notes += [f"{name}: {batch}" for name, batch in found.items()]
+    return str(report.finish())
 
 
 def _settled(measured: Subject, cfg, batch: int) -> Subject:
@@ -166,8 +167,9 @@ def largest(fits: Callable[[int], bool]) -> int:
 def _fits(measured: Subject, cfg, batch: int) -> bool:
     """Whether two steps run beside an average of the weights: Adam's moments come with the first."""
     renderer = replace(measured.model.renderer, backend="auto")
+    kind = "channels_last" if channels_last(None, measured.device, False) else "eager"  # a run's own choice
     try:
-        step = step_of(measured, cfg, scene(measured, cfg.data.target_views, batch), renderer, "eager")
+        step = step_of(measured, cfg, scene(measured, cfg.data.target_views, batch), renderer, kind)
         average = [parameter.clone() for parameter in measured.model.parameters()]
         step()
         step()

@@ -13,7 +13,7 @@ import torch
 import costs
 from harness import Row, Variant, interleaved, parser, settings_of
 from nerfdiff.render.renderer import Rendering
-from report import report
+from report import Report
 from subjects import Subject, scene, subject
 from variants import models
 
@@ -24,14 +24,14 @@ def main(words: list[str] | None = None) -> str:
     arguments = _arguments(words)
     measured = subject(arguments)
     limit = measured.limits(arguments.seconds)
-    rows: list[Row] = []
-    if arguments.sweep is None:
-        rows += _encoder(measured, arguments.compile, arguments.seconds)
-    for setting in settings_of(arguments, {"views": arguments.views}, SWEEPS):
-        rows += _denoiser(measured, setting["views"], arguments.compile, arguments.seconds)
     notes = ["MB is what operators read and write one by one; fused ones move less"]
-    settings = {"views": arguments.views}
-    return str(report("unet", measured, rows, limit, settings, arguments.out, notes, arguments.sweep))
+    usual = {"views": arguments.views}
+    report = Report("unet", measured, limit, usual, arguments.out, notes, arguments.sweep)
+    if arguments.sweep is None:
+        report.add(_encoder(measured, arguments.compile, arguments.seconds))
+    for setting in settings_of(arguments, usual, SWEEPS):
+        report.add(_denoiser(measured, setting["views"], arguments.compile, arguments.seconds))
+    return str(report.finish())
 
 
 @torch.no_grad()

@@ -1,15 +1,18 @@
 """Random triplane fields and rays, rendered by the kernels and by the float64 reference."""
 
+import random
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from nerfdiff.cameras import Cameras, Rays
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.field import TriplaneField
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.render.kernels import passes
-from nerfdiff.render.kernels.arguments import Settings
+from nerfdiff.render.kernels.arguments import Bundle, Fields, Settings
 from nerfdiff.render.kernels.function import fused_render
 from nerfdiff.render.renderer import Renderer
 from nerfdiff.render.sampling import KEPT
@@ -92,15 +95,33 @@ class Case:
     def rays(self, leaves) -> Rays:
         return Rays(*leaves[5:], self.ray_near.to(leaves[5]), self.ray_far.to(leaves[5]))
 
-    def reference(self, dtype=torch.float64) -> tuple[list[torch.Tensor], dict[str, torch.Tensor]]:
-        """Outputs and gradients by the PyTorch renderer, on the CPU."""
-        leaves = [leaf.to(dtype).requires_grad_() for leaf in self.leaves]
+    def reference(self, distances: Tensor | None = None) -> tuple[list[Tensor], dict[str, Tensor]]:
+        """Outputs and gradients by the PyTorch renderer, in float64 on the CPU.
+
+        Args:
+            distances: [scenes, n, samples], ascending; None leaves it to the renderer where to look.
+        """
+        leaves = [leaf.double().requires_grad_() for leaf in self.leaves]
         field = self.field(leaves)
         decoder = (field.decoder.hidden.weight, field.decoder.hidden.bias)
         leaves[1:5] = *decoder, field.decoder.output.weight, field.decoder.output.bias
-        jitter = None if self.jitter is None else self.jitter.to(dtype)
-        out = self.renderer.render(field, self.rays(leaves), jitter, self.coarse)
-        return _with_gradients([out.rgb, out.opacity, out.depth], leaves, self.d_outputs)
+        rays = self.rays(leaves)
+        if distances is None:
+            jitter = None if self.jitter is None else self.jitter.double()
+            out = self.renderer.render(field, rays, jitter, self.coarse)
+            outputs = [out.rgb, out.opacity, out.depth]
+        else:
+            seen = self.renderer._query(field, rays, distances.double())
+            outputs = list(self.renderer._composite(rays, distances.double(), *seen))
+        return _with_gradients(outputs, leaves, self.d_outputs, NAMES)
+
+    def packed(self) -> tuple[Fields, Bundle]:
+        """As kernels read them."""
+        planes, *decoder = (leaf.to(DEVICE) for leaf in self.leaves[:5])
+        frustum = (value.to(DEVICE) for value in (self.K, self.near, self.far))
+        rays = (*self.leaves[5:], self.ray_near, self.ray_far, self.jitter, self.coarse)
+        bundle = Bundle(*(None if value is None else value.to(DEVICE) for value in rays))
+        return Fields(planes.movedim(2, -1).contiguous(), *frustum, *decoder), bundle
 
     def settings(self, precision: str = "ieee", ordered: bool = False, points: int = 10**6) -> Settings:
         samples = self.uniform, self.importance, self.background
@@ -113,17 +134,55 @@ class Case:
         outputs = fused_render(settings, _no_recovery, keep_coarse, *leaves, *there)
         return outputs if keep_coarse else outputs[:3]
 
-    def fused(self, **settings) -> tuple[list[torch.Tensor], dict[str, torch.Tensor]]:
-        """Outputs and gradients by the kernels."""
-        leaves = [leaf.to(DEVICE).requires_grad_() for leaf in self.leaves]
+    def fused(self, wanted: Sequence[str] = NAMES, **settings) -> tuple[list[Tensor], dict[str, Tensor]]:
+        """Outputs by the kernels, and the gradients that are wanted."""
+        leaves = [leaf.to(DEVICE).requires_grad_(name in wanted) for name, leaf in zip(NAMES, self.leaves, strict=True)]
         outputs = self.render(leaves, self.settings(**settings))
-        return _with_gradients(outputs, leaves, self.d_outputs)
+        return _with_gradients(outputs, leaves, self.d_outputs, wanted)
+
+    def rounding_decides(self, distances: Tensor, margin: float = 2e-5) -> Tensor:
+        """Of which rays [scenes, n] a sample is so near to a jump that fp32 may see it on the other side.
+
+        Density jumps at the near plane, and slopes do from texel to texel.
+        """
+        leaves = [leaf.double() for leaf in self.leaves]
+        points = self.rays(leaves).at(distances.double())
+        places, valid = self.field(leaves).triplane.frustum_coordinates(points.flatten(1, 2))
+        places, valid = 0.5 * (places + 1).reshape(points.shape), valid.reshape(distances.shape)
+        near = (points[..., 2] - self.near.double()[:, None, None]).abs() < margin
+        height, width = self.plane
+        for axis, sizes in enumerate(((width,), (height,), (height, width))):
+            for size in sizes:
+                position = places[..., axis] * size - 0.5
+                near |= valid & ((position - position.round()).abs() < margin)
+        return near.any(-1)
+
+
+def drawn_case(draw: random.Random) -> Case:
+    """Any shape out of the product of all, with inputs of its own."""
+    importance = draw.choice((0, 1, 2, 3, 5, 8, 13))
+    return Case(
+        scenes=draw.randint(1, 3),
+        n=draw.randint(1, 40),
+        channels=draw.choice((1, 3, 8, 16, 17, 24)),
+        hidden=draw.choice((1, 6, 16, 20, 33)),
+        plane=(draw.randint(1, 9), draw.randint(1, 9)),
+        uniform=draw.choice((1, 2, 3, 5, 8, 11, 16)),
+        importance=importance,
+        background=draw.choice((None, 0.0, 0.4, 1.0)),
+        jittered=draw.random() < 0.5,
+        cached=importance > 0 and draw.random() < 0.3,
+        own_decoders=draw.random() < 0.5,
+        seed=draw.randrange(2**31),
+    )
 
 
 def _no_recovery(error, *_):
     raise error
 
 
-def _with_gradients(outputs, leaves, d_outputs):
+def _with_gradients(outputs, leaves, d_outputs, wanted):
+    leaves = [leaf for name, leaf in zip(NAMES, leaves, strict=True) if name in wanted]
     found = torch.autograd.grad(outputs, leaves, [d.to(o) for d, o in zip(d_outputs, outputs, strict=True)])
-    return [o.detach().cpu() for o in outputs], {k: v.cpu() for k, v in zip(NAMES, found, strict=True)}
+    there = [name for name in NAMES if name in wanted]
+    return [o.detach().cpu() for o in outputs], {k: v.cpu() for k, v in zip(there, found, strict=True)}

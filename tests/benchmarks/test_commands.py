@@ -1,6 +1,7 @@
 """Every benchmark as a command, at a size of seconds: what it writes, never how long it took."""
 
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -8,11 +9,14 @@ import torch
 
 import all as all_of_them
 import field_speed
+import harness
 import inner_step
 import ngd_object
 import render
 import training_step
 import unet
+from nerfdiff.distill.distillation import Distillation
+from nerfdiff.errors import ConfigError
 
 TOY = ["--size", "16", "--seconds", "0.001", "--device", "cpu", "--precision", "32-true"]
 SMALL = ["model.unet.channel_mult=[1,2]", "model.render.uniform_samples=4", "model.render.importance_samples=4"]
@@ -22,6 +26,7 @@ def run(command, out, *words) -> dict:
     path = Path(command.main([*SMALL, *TOY, "--out", str(out), *words]))
     assert path.parent == out
     content = json.loads(path.read_text())
+    assert content["complete"] and not list(out.glob("*.partial.json"))
     assert content["benchmark"] == command.__name__ and content["model"] == "tiny" and content["image_size"] == [16, 16]
     assert content["limits"]["copy"] > 0 and content["limits"]["matrix"] > 0
     for row in content["rows"]:
@@ -73,7 +78,9 @@ def test_unet_times_encoder_and_denoiser(tmp_path):
 
 def test_ngd_object_times_an_object_and_its_parts(tmp_path):
     budget = ["--sweep", "views", "--values", "2", "--steps", "2"]
-    content = run(ngd_object, tmp_path, *budget, "--extrapolate")
+    fewer = ["--with", "strategy.coarse=refresh", "budget.steps=2", "budget.inner_steps=1"]
+    content = run(ngd_object, tmp_path, *budget, "--extrapolate", *fewer)
+    assert content["settings"]["fast"] == " ".join(fewer[1:]) and content["settings"]["overrides"] == " ".join(SMALL)
     rows, steps = ran(content), content["settings"]["steps"]
     whole = rows["object, reference"]
     assert whole["more"]["extrapolated from steps"] == 2 and f"2 of {steps}" in content["notes"][0]
@@ -82,11 +89,23 @@ def test_ngd_object_times_an_object_and_its_parts(tmp_path):
     once = parts["encode"]["work"]["flops"] + parts["conditions"]["work"]["flops"]
     each = sum(parts[part]["work"]["flops"] for part in ("denoise K views", "render K views", "N inner steps"))
     assert whole["work"]["flops"] == pytest.approx(once + steps * each)
+    fast, fitted = rows["object, fast"], rows["N inner steps, fast"]["work"]["flops"]
+    each += fitted - parts["N inner steps"]["work"]["flops"]
+    assert fast["work"]["flops"] == pytest.approx(once + 2 * each)
+    assert "extrapolated from steps" not in fast["more"]
+    assert fast["ratio"] == pytest.approx(whole["seconds"]["median"] / fast["seconds"]["median"])
+    assert "encode, fast" not in rows  # it is the same
 
 
-def test_what_is_timed_in_part_is_said(tmp_path):
-    words = ["--sweep", "scenes", "--values", "2", "--steps", "1", "--whole", "--strategy", "sds"]
+def test_what_is_timed_in_part_is_said(tmp_path, monkeypatch):
+    distil, made = Distillation.distil, []
+    monkeypatch.setattr(
+        Distillation, "distil", lambda own, *a: made.append((own.coarse, own.cuda_graphs)) or distil(own, *a)
+    )
+    words = ["--sweep", "scenes", "--values", "2", "--steps", "1", "--whole", "--few", "--strategy", "sds"]
     content = run(ngd_object, tmp_path, *words)
+    assert set(made) == {("every_step", False), ("every_step", True), ("refresh", True)}
+    assert len(content["rows"]) == 3 and "2 objects, fast" in ran(content)
     assert content["notes"][0].startswith("PARTIAL: objects are of 1 diffusion steps")
     row = ran(content)["2 objects, reference"]
     assert row["more"]["s/object"] == pytest.approx(row["seconds"]["median"] / 2)
@@ -97,12 +116,55 @@ def test_extrapolating_asks_for_what_it_needs():
     for words in (["--extrapolate"], ["--extrapolate", "--steps", "1"]):
         with pytest.raises(SystemExit):
             ngd_object.main(words)
+    # as many full evaluations of the CDM as there will be, by the share of the steps
+    with pytest.raises(ConfigError, match="multiple of 4"):
+        ngd_object.main([*SMALL, *TOY, "--extrapolate", "--steps", "6", "--with", "budget.deep_every=2"])
+    with pytest.raises(ConfigError, match="same views"):
+        ngd_object.main([*SMALL, *TOY, "--with", "budget.views=3"])
+
+
+@pytest.mark.parametrize(("command", "groups"), [(render, 1), (ngd_object, 2)])
+def test_what_was_measured_before_a_benchmark_is_stopped_is_in_its_file(command, groups, tmp_path, monkeypatch):
+    interleaved, measured = command.interleaved, []
+
+    def stopped(*args):
+        if len(measured) == groups:
+            raise KeyboardInterrupt
+        measured.append(interleaved(*args))
+        return measured[-1]
+
+    monkeypatch.setattr(command, "interleaved", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        command.main([*SMALL, *TOY, "--out", str(tmp_path)])
+    (path,) = tmp_path.iterdir()
+    content = json.loads(path.read_text())
+    assert path.name.endswith(".partial.json") and content["complete"] is False
+    rows = [row for group in measured for row in group.values()]
+    assert [row["name"] for row in content["rows"]] == [row.name for row in rows]
+    assert [row["seconds"] for row in content["rows"]] == [row.seconds for row in rows]
+
+
+@pytest.mark.parametrize("command", [training_step, ngd_object])
+def test_what_there_is_no_time_for_is_said(command, tmp_path, monkeypatch):
+    monkeypatch.setattr(harness.DEADLINE, "end", math.inf)  # as it was before, afterwards
+    report = command.Report
+
+    def late(*args):
+        harness.DEADLINE.set("0")
+        return report(*args)
+
+    monkeypatch.setattr(command, "Report", late)
+    path = Path(command.main([*SMALL, *TOY, "--out", str(tmp_path)]))
+    content = json.loads(path.read_text())
+    assert content["complete"] is False and path.name.endswith(".partial.json") and [path] == list(tmp_path.iterdir())
+    assert not ran(content) and harness.NO_TIME in {row["reason"] for row in content["rows"]}
 
 
 def test_extrapolation_repeats_the_steps_alone():
     once, each = 5.0, 3.0
     measured = {steps: once + each * steps for steps in (2, 4)}
     assert ngd_object.extrapolated(measured, 64) == pytest.approx(once + each * 64)
+    assert ngd_object.extrapolated({2: 9.0, 4: 8.0}, 64) == pytest.approx(2.0 * 64)
 
 
 def test_training_step_times_a_step_and_finds_the_largest_batch(tmp_path):

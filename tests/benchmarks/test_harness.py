@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 from types import SimpleNamespace
 
 import pytest
@@ -60,6 +61,19 @@ def test_what_is_slow_is_measured_at_least_once(takes):
     assert row.seconds == {"n": 1, "median": 100.0, "iqr": 0.0}
 
 
+def test_after_the_deadline_what_has_begun_is_measured_once_more(takes, monkeypatch):
+    monkeypatch.setattr(harness.DEADLINE, "end", math.inf)
+    slow = takes(0.1)
+
+    def last():
+        harness.DEADLINE.set("0")
+        slow()
+
+    rows = interleaved({"begun": takes(0.1), "last": last, "late": takes(0.1)}, CPU, 1.0)
+    assert rows["begun"].seconds["n"] == rows["last"].seconds["n"] == 1
+    assert (rows["late"].seconds, rows["late"].reason) == (None, harness.NO_TIME)
+
+
 def test_what_cannot_run_is_a_row_with_its_reason(takes):
     def fails():
         raise RuntimeError("no such unit\nand a long tail")
@@ -92,7 +106,9 @@ def test_the_file_says_what_was_measured_on_what(tmp_path, capsys):
     rows = [Row("plain", {"rays": n}, {"n": 3, "median": n / 10, "iqr": 0.01}, 1.0, Work(2e9, 4e8)) for n in (1, 2)] + [
         Row("fused", {"rays": n}, reason="needs wings") for n in (1, 2)
     ]
-    path = report.report("render", subject, rows, Limits(1e10, 1e12, "float32"), {"K": 3}, tmp_path, ["a note"], "rays")
+    table = report.Report("render", subject, Limits(1e10, 1e12, "float32"), {"K": 3}, tmp_path, ["a note"], "rays")
+    table.add(rows)
+    path = table.finish()
     content = json.loads(path.read_text())
     facts = content["environment"]
     assert path.name == f"render-rays-toy-model-{report.slug(facts['cpu'])}-{content['time'][:10]}.json"

@@ -18,8 +18,9 @@ from nerfdiff.render.sampling import KEPT, in_bins, uniform_edges
 
 _coarse = Launch(coarse_kernel, [(4, 16, 4), (8, 8, 4), (8, 16, 8), (2, 32, 4)], (4, 8))
 _composite = Launch(composite_kernel, [(4, 16, 4), (8, 8, 4), (8, 16, 8), (2, 32, 4)], (4, 8))
+# At model B's sizes registers spill least where a thread has few points; (4, 16, 8) spills, and has fewer tiles.
 _gradient = Launch(
-    gradient_kernel, [(2, 16, 4), (4, 16, 4), (8, 8, 4), (4, 16, 8)], (4, 8), added_to=["d_planes", "d_decoder"]
+    gradient_kernel, [(2, 16, 8), (1, 32, 4), (1, 16, 4), (4, 16, 8)], (4, 8), added_to=["d_planes", "d_decoder"]
 )
 
 

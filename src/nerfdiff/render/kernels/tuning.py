@@ -33,14 +33,15 @@ class Launch:
         interpreted: tuple[int, int],
         added_to: Sequence[str] = (),
     ):
+        self.kernel, self.blocks = kernel, tuple(blocks)
         if not INTERPRETED:
             # One stage: gathers feed products through arithmetic, and copies kept in flight would fill shared memory.
             configs = [triton.Config({"R": r, "S": s}, num_warps=warps, num_stages=1) for r, s, warps in blocks]
             key = [name for name in _KEY if name in kernel.arg_names]
             self._tuned = triton.autotune(configs, key, restore_value=list(added_to), cache_results=True)(kernel)
-            self._fixed, self._block = kernel, configs[0].all_kwargs()
+            self._block = configs[0].all_kwargs()
         else:
-            self._tuned, self._fixed, self._block = None, kernel, dict(zip("RS", interpreted, strict=True))
+            self._tuned, self._block = None, dict(zip("RS", interpreted, strict=True))
 
     def __call__(self, grid: Callable[[dict], tuple], fixed: bool, **arguments) -> None:
         """Run the kernel on the programs that `grid` counts for its constants.
@@ -49,7 +50,7 @@ class Launch:
             fixed: use the first block sizes, whatever the clock says: sums come in the same order in every process.
         """
         if fixed or self._tuned is None:
-            self._fixed[grid](**arguments, **self._block)
+            self.kernel[grid](**arguments, **self._block)
         else:
             self._tuned[grid](**arguments)
 

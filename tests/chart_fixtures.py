@@ -22,6 +22,7 @@ KNOWN = {
     "best": ("sds", 32.0, 22.05, 0.15),
 }
 STEPS = dict(zip(KNOWN, (1, 2, 4, 8, 16), strict=True))  # an override in which they differ
+TIME = "2026-01-01T00:00:00+00:00"
 FRONTIERS = {"psnr": ["cheap", "good", "best"], "st_lpips_vgg": ["cheap", "worse", "good", "slow"]}
 
 
@@ -34,9 +35,10 @@ def result(name: str = "good", seed: int = 0, **values) -> ResultRow:
     strategy, seconds, psnr, st_lpips = KNOWN[name]
     overrides = [f"seed={seed}", f"strategy={strategy}", f"budget.inner_steps={STEPS[name]}", "ckpt=demo"]
     base = {
-        "run_id": f"{name}-{seed}", "status": "ok", "command": f"python src/distill.py {' '.join(overrides)}",
-        "overrides": overrides, "seed": seed, "dataset": "srn_cars/test", "split_sha256": "f00", "n_scenes": 3,
-        "n_views": 12, "image_size": [32, 32], "strategy": strategy, "psnr": psnr, "st_lpips_vgg": st_lpips,
+        "run_id": f"{name}-{seed}", "time": TIME, "status": "ok",
+        "command": f"python src/distill.py {' '.join(overrides)}", "overrides": overrides,
+        "seed": seed, "dataset": "srn_cars/test", "split_sha256": "f00", "n_scenes": 3, "n_views": 12,
+        "image_size": [32, 32], "strategy": strategy, "psnr": psnr, "st_lpips_vgg": st_lpips,
         "scene_s": timing(seconds, seconds / 10), "denoiser_calls": 0 if strategy == "none" else round(3 * seconds),
         "params": 5_000_000, "device": "cpu", "cpu": "Test CPU",
     }  # fmt: skip

@@ -3,6 +3,7 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -58,7 +59,12 @@ def test_units_are_the_pages(tmp_path):
     assert values["peak_mem_bytes"] == [3.0]
     assert values["field_queries"] == [2.0]  # millions, per scene
     assert values["denoiser_calls"] == [8.0]
-    assert values["scene_s"] == [8.0, 7.6, 8.4]
+    assert values["scene_s"] == [8.0, 7.6, 8.4]  # of an interquartile range of 0.8
+
+
+def test_the_page_says_what_its_intervals_are(tmp_path):
+    words = content(chart(write_results(tmp_path, result())))["how"]
+    assert "95% bootstrap" in words and "the median ± half the interquartile range" in words
 
 
 def test_tables_and_pictures_lie_beside_the_page(tmp_path):
@@ -114,6 +120,65 @@ def test_configurations_are_called_by_what_tells_them_apart(tmp_path):
         {"strategy": "ngd", "a.steps": "1", "b.steps": "1", "backend": "torch"},
         {"strategy": "ngd", "a.steps": "2", "b.steps": "0", "backend": "triton"},
     ]
+
+
+def sweep(name: str, constants: tuple[str, ...], *varied: str, **values):
+    return result(name, overrides=[f"strategy={KNOWN[name][0]}", *varied, *constants], **values)
+
+
+def test_names_have_no_constants_of_a_sweep_nor_places_and_nothing_twice(tmp_path):
+    constants = ("sweep=speed_accuracy", "budget=minutes", "ckpt=runs/base", "data.cache_dir=data/cache", "threads=1")
+    rows = [
+        sweep(
+            name, constants, f"precision={precision}", f"uniform_samples={n}", f"importance_samples={n}",
+            "backend=auto", f"budget.views={views}", f"strategy.teacher.sampler={sampler}", precision=precision,
+            samples_per_ray=2 * n, field="triplane", model="tiny", K=views, backend="cpu", run_id=f"{name}-{precision}",
+        )
+        for name, precision, n, views, sampler in (
+            ("good", "32-true", 6, 5, "ddim"), ("slow", "bf16-mixed", 6, 10, "ddim"),
+            ("worse", "bf16-mixed", 12, 10, "dpmpp_2m"),
+        )
+    ]  # fmt: skip
+    other = ("ckpt=runs/pixelnerf", "run_name=pixelnerf", "results=runs/fields/results.jsonl")
+    rows += [
+        sweep("cheap", other, field="pixelnerf", model="other", precision="32-true", samples_per_ray=24, backend="cpu"),
+        sweep("cheap", ("ckpt=demo",), field="triplane", model="tiny", precision="32-true", backend="cpu", run_id="x"),
+    ]
+    entries = content(chart(write_results(tmp_path, *rows)))["configurations"]
+    assert [entry["labels"] for entry in entries[:4]] == [
+        {"strategy": "ngd", "views": "5", "ckpt": "base", "importance_samples": "6", "sampler": "ddim",
+         "uniform_samples": "6", "precision": "32-true"},
+        {"strategy": "ngd", "views": "10", "ckpt": "base", "importance_samples": "6", "sampler": "ddim",
+         "uniform_samples": "6", "precision": "bf16-mixed"},
+        {"strategy": "direct", "views": "10", "ckpt": "base", "importance_samples": "12", "sampler": "dpmpp_2m",
+         "uniform_samples": "12", "precision": "bf16-mixed"},
+        {"strategy": "none", "ckpt": "pixelnerf", "precision": "32-true"},
+    ]  # fmt: skip
+    names = ["ngd views=5", "ngd views=10", "direct", "none ckpt=pixelnerf", "none ckpt=demo"]
+    assert [entry["name"] for entry in entries] == names
+
+
+@pytest.mark.parametrize(
+    ("settings", "names"),
+    [
+        ([["a.x=1"], []], ["ngd x=1", "ngd"]),  # an override that others lack
+        ([["threads=1"], ["threads=2"]], ["ngd threads=1", "ngd threads=2"]),  # of those not named otherwise
+        ([["precision=auto"], ["precision=32-true"], []], ["ngd precision=auto", "ngd precision=32-true", "ngd"]),
+        ([["ckpt=a/x/last.ckpt"], ["ckpt=b/x/last.ckpt"]], ["ngd ckpt=a/x/last.ckpt", "ngd ckpt=b/x/last.ckpt"]),
+        ([None, None], ["ngd run_id=0", "ngd run_id=1"]),
+    ],
+)
+def test_what_differs_in_little_is_told_apart_by_it(tmp_path, settings, names):
+    rows = [result(overrides=words, run_id=str(number), precision="32-true") for number, words in enumerate(settings)]
+    assert [entry["name"] for entry in content(chart(write_results(tmp_path, *rows)))["configurations"]] == names
+
+
+def test_names_are_as_many_as_configurations(tmp_path):
+    rng = np.random.default_rng(0)
+    settings = {tuple(f"{key}={rng.integers(4)}" for key in "abcdefgh" if rng.random() < 0.7) for _ in range(150)}
+    rows = [result(overrides=list(words), run_id=str(number)) for number, words in enumerate(sorted(settings))]
+    names = [entry["name"] for entry in content(chart(write_results(tmp_path, *rows)))["configurations"]]
+    assert len(set(names)) == len(settings)
 
 
 def test_failed_runs_are_told_and_keep_their_reason(tmp_path):
@@ -187,3 +252,11 @@ def test_several_results_make_one_page(tmp_path):
     page = chart([tmp_path / "a" / "results.jsonl", tmp_path / "b"])
     assert page.parent == tmp_path / "a" / "chart" and len(content(page)["configurations"]) == 2
     assert len(content(chart(tmp_path))["configurations"]) == 2
+
+
+def test_a_file_that_is_named_twice_is_read_once(tmp_path, monkeypatch):
+    monkeypatch.chdir(write_results(tmp_path, result(), failed("slow")))
+    (tmp_path / "link").symlink_to(tmp_path, target_is_directory=True)
+    known = content(chart([tmp_path, ".", tmp_path / "results.jsonl", tmp_path / "link"]))
+    assert known["counts"].startswith("2 runs, 1 configurations, 1 failed runs")
+    assert len(known["configurations"][0]["runs"]) == 1

@@ -29,14 +29,14 @@ LOST = "net::ERR_FILE_NOT_FOUND"
 
 @pytest.fixture(scope="module")
 def page_path(tmp_path_factory) -> Path:
-    """`KNOWN` on one device, one with two seeds, scores and pictures; some on others; four that failed."""
+    """`KNOWN` on one device, one with two seeds, scores and pictures; some on others; five that failed."""
     folder = tmp_path_factory.mktemp("results")
     rows = [result(name, folder=f"{name}0") for name in KNOWN]
     rows += [result("good", 1, folder="good1")]
     rows += [result(name, device="Fast GPU", scene_s=timing(cost)) for name, cost in (("good", 0.5), ("worse", 0.25))]
     rows += [result(device="Clockless", scene_s=None, denoiser_calls=None, params=None)]
     rows += [failed("slow", 1), failed("slow", 2, status="nan", error="rgb is <not> finite")]
-    rows += [failed("good", 7, device="Fast GPU")]
+    rows += [failed("good", 7, device="Fast GPU"), failed("best", 5, device="Small GPU")]
     for seed, shift in ((0, 0.0), (1, 0.5)):
         scores = dict(zip(SCENES, (20.0 - shift, 22.0, 24.0 + shift), strict=True))
         write_scores(folder / f"good{seed}", "ngd", scores)
@@ -157,11 +157,11 @@ def test_selectors_change_what_is_shown(page):
     assert dict(zip(*ticks, strict=True))[drawn(page, "frontier")[0][0]] == "0"
     page.select_option("#colour", "inner_steps")
     assert page.locator("#plot .legendtext").all_text_contents()[:5] == ["1", "2", "4", "8", "16"]
-    assert page.locator("#failed-strip button").count() == 2
+    assert page.locator("#failed-strip button").count() == 3
     page.select_option("#device", "Fast GPU")
     assert drawn(page, "frontier").keys() | drawn(page, "dominated").keys() == {5, 6}
     assert page.input_value("#cost") == "denoiser_calls"  # as chosen
-    assert page.locator("#failed-strip button").count() == 3  # two failed before they knew their device
+    assert page.locator("#failed-strip button").count() == 4  # three of no device, or of one without a success
     assert page.locator("#table tbody tr").count() == 2
 
 
@@ -185,6 +185,46 @@ def test_a_link_shows_what_was_chosen(page, page_path):
         "scene_s",
         "strategy",
     ]
+
+
+def test_an_open_page_follows_its_address(page):
+    page.evaluate("location.hash = 'panel=0&metric=st_lpips_vgg&cost=denoiser_calls&colour=inner_steps'")
+    page.wait_for_function("document.getElementById('cost').value === 'denoiser_calls'")
+    assert page.get_attribute("[data-metric=st_lpips_vgg]", "aria-pressed") == "true"
+    assert page.input_value("#colour") == "inner_steps"
+
+
+def groups(page) -> dict[str, object]:
+    """Whether each entry of the legend is shown."""
+    entries = page.evaluate(
+        f"{PLOT}._fullData.filter(({{ meta }}) => meta === 'legend').map((t) => [t.name, t.visible])"
+    )
+    return dict(entries)
+
+
+def test_what_the_legend_hides_stays_hidden_and_nothing_else_is(page):
+    page.locator("#plot .legendtoggle").nth(1).click()
+    page.wait_for_function(f"{PLOT}._fullData.some((trace) => trace.visible === 'legendonly')")
+    hidden = {"direct": True, "ngd": "legendonly", "none": True, "sds": True}
+    assert groups(page) == hidden
+    page.click("[data-metric=st_lpips_vgg]")
+    assert groups(page) == hidden
+    page.select_option("#colour", "inner_steps")  # numbers, whose legend hides nothing
+    assert set(groups(page).values()) == {True}
+    page.locator("#plot .legendtoggle").nth(1).click(force=True)
+    page.wait_for_timeout(500)  # as long as a double click may take
+    assert set(groups(page).values()) == {True}
+    assert drawn(page, "frontier").keys() | drawn(page, "dominated").keys() == set(range(5))
+    page.select_option("#colour", "strategy")
+
+
+def test_what_memory_is_on_a_cpu_is_told(open_page, tmp_path):
+    rows = [result(peak_mem_bytes=2**30), result("slow", peak_mem_bytes=2**31, device="GPU")]
+    page = open_page(chart(write_results(tmp_path, *rows)))
+    page.select_option("#cost", "peak_mem_bytes")
+    assert "resident set of the whole process" in page.inner_text("#plot-note")
+    page.select_option("#device", "GPU")
+    assert page.input_value("#cost") == "peak_mem_bytes" and "resident" not in page.inner_text("#plot-note")
 
 
 def test_what_has_no_cost_is_in_the_table_alone(page):
@@ -265,7 +305,7 @@ def test_the_advice_is_the_fastest_within_x_of_the_best(page, metric):
 
 def test_failed_runs_say_why(page):
     strip = page.locator("#failed-strip button")
-    assert [text.split(" ")[1] for text in strip.all_inner_texts()] == ["oom", "nan"]
+    assert [text.split(" ")[1] for text in strip.all_inner_texts()] == ["oom", "nan", "oom"]
     strip.nth(1).click()
     details = page.inner_text("#details")
     assert "rgb is <not> finite" in details and "budget.inner_steps=8" in details
@@ -333,7 +373,7 @@ def test_five_thousand_rows_stay_light(open_page, tmp_path):
     """What makes pages slow does not grow with the rows: elements, and points that are elements."""
     rng = np.random.default_rng(0)
     costs, values = 10 ** rng.uniform(0, 3, 5000), rng.normal(20, 1, 5000)
-    settings = [[f"budget.inner_steps={n % 50}", f"data.eval_stride={n // 50}"] for n in range(5000)]
+    settings = [[f"budget.inner_steps={n % 50}", f"budget.lr={n / 1000}", f"x=w{n // 9}"] for n in range(5000)]
     row = asdict(result())
     lines = [
         row | {"psnr": psnr, "scene_s": timing(cost), "overrides": words, "command": " ".join(words), "run_id": str(n)}
@@ -345,6 +385,12 @@ def test_five_thousand_rows_stay_light(open_page, tmp_path):
     points = [trace for kind in ("frontier", "dominated") for trace in traces(page, kind)]
     assert sum(len(trace["x"]) for trace in points) == 5000
     assert {trace["type"] for trace in points} == {"scattergl"}
+    for key in ("lr", "x", "inner_steps"):  # 5000 numbers, 556 words, 50 numbers
+        page.select_option("#colour", key)
+        assert page.evaluate(f"{PLOT}.data.length") < 40
+        assert sum(len(trace["x"]) for kind in ("frontier", "dominated") for trace in traces(page, kind)) == 5000
+    assert page.evaluate(f"{PLOT}.data.every(({{ error_y }}) => !error_y?.visible)")
+    assert "Intervals of more than 400 points" in page.inner_text("#plot-note")
     assert page.evaluate("document.querySelectorAll('*').length") < 3000
     best = {n for n in range(5000) if not ((costs <= costs[n]) & (values > values[n])).any()}
     assert drawn(page, "frontier").keys() == best

@@ -55,6 +55,25 @@ def test_a_failure_on_another_device_stays(tmp_path):
     assert [(r.device, r.row.status) for r in newest(runs)] == [("H100", "oom"), ("Test CPU", "ok")]
 
 
+def test_failures_are_those_of_their_device_or_of_any(tmp_path):
+    others = [failed(seed=1, device="H100"), failed(seed=2, device="cpu", cpu="Test CPU"), failed(seed=3)]
+    found = configurations(
+        runs_of(tmp_path, result(), result(device="H100"), result(device="H200"), *others), BOOTSTRAP
+    )
+    assert [c.failed for c in found] == [2, 2, 1]
+
+
+def test_a_run_in_several_files_counts_once_and_the_newest_is_kept(tmp_path):
+    later = dataclasses.replace(result(psnr=23.0), time="2026-02-01T00:00:00+00:00")
+    runs = [
+        *runs_of(tmp_path / "a", later, failed("slow")),
+        *runs_of(tmp_path / "b", result(), failed("slow"), result(seed=1)),
+    ]
+    assert [(r.row.run_id, r.row.psnr) for r in newest(runs)] == [("slow-0", None), ("good-1", 22.0), ("good-0", 23.0)]
+    (found,) = configurations(runs, BOOTSTRAP)
+    assert found.seeds == [1, 0] and found.runs[1].home == tmp_path / "a"
+
+
 def test_failures_of_one_configuration_are_not_those_of_another(tmp_path):
     found = configurations(runs_of(tmp_path, result(), result("slow"), failed("slow", 1), failed("slow", 2)), BOOTSTRAP)
     assert [c.failed for c in found] == [0, 2]

@@ -31,9 +31,10 @@ from nerfdiff.results.frame import (
 log = logging.getLogger(__name__)
 
 HOW = (
-    "A point is a configuration: runs that agree in everything but their seed. Intervals of qualities measured per "
-    "scene are {level:.0%} bootstrap intervals over scenes and seeds; of Fréchet distances, counts and sizes the range "
-    "over seeds; of seconds the mean over seeds of the medians, with quartiles of the fastest and the slowest seed. "
+    "A point is a configuration: runs that agree in everything but their seed. Its name has what tells it from the "
+    "others, a click shows all of its settings. Intervals of qualities measured per scene are {level:.0%} bootstrap "
+    "intervals over scenes and seeds; of Fréchet distances, counts and sizes the range over seeds. Seconds are the "
+    "mean over seeds of the medians; their intervals span the median ± half the interquartile range of every seed. "
     "Faint points are dominated: another is at least as good and as cheap, and better in one. Rings: some runs failed."
 )
 """What the page says of its numbers."""
@@ -67,7 +68,7 @@ def build_chart(cfg: DictConfig) -> Path:
     out = Path(cfg.out) if cfg.out is not None else _folder(places[0]) / "chart"
     metrics, costs = _plain(cfg.metrics), _plain(cfg.costs)
     bootstrap = instantiate(cfg.bootstrap)
-    content = measured(configurations(found.runs, bootstrap), metrics, costs)
+    content = measured(configurations(found.runs, bootstrap), metrics, costs, cfg.unnamed)
     published = [published_for(panel, **_plain(cfg.published)) for panel in content.panels]
     failed = failures(found.runs)
 
@@ -111,9 +112,12 @@ def _folder(place: Path) -> Path:
 
 
 def _read(places: Sequence[Path]) -> Found:
-    found, first = Found(), None
+    found, first, seen = Found(), None, set()
     for place in places:
         for path in find_results(place):
+            if (file := path.resolve()) in seen:
+                continue
+            seen.add(file)
             try:
                 found.runs += read_runs(path)
                 found.files += 1
@@ -150,7 +154,8 @@ def _values(
         entry["small"] = sheet
     lost = [failure_values(run) for run in failed]
     panels = [
-        {"device": p.device, "test": p.data, "members": p.members, "published": entries, "frontiers": frontiers}
+        {"device": p.device, "cpu": p.cpu, "test": p.data, "members": p.members}
+        | {"published": entries, "frontiers": frontiers}
         for p, entries, frontiers in zip(content.panels, published, content.frontiers, strict=True)
     ]
     return {

@@ -1,7 +1,7 @@
 """How configurations are called: by the settings in which they differ."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Hashable, Iterable, Sequence
 
 from nerfdiff.results.frame import Configuration
 
@@ -9,53 +9,137 @@ FIELDS = (
     "model", "field", "backend", "compile", "precision", "scenes_at_once", "samples_per_ray", "K", "prior", "weights",
     "ckpt_sha256",
 )  # fmt: skip
+SETTLED_BY = {
+    "model": ("ckpt",), "field": ("ckpt",), "ckpt_sha256": ("ckpt",), "K": ("budget.views",),
+    "samples_per_ray": ("uniform_samples", "importance_samples"),
+}  # fmt: skip
+"""Overrides which say what a field of the row says, and more."""
 DIGITS = 8  # of a digest
 ROW = "row."
+CKPT = "ckpt"  # the one path that is told
+RUN = ROW + "run_id"  # where nothing else differs
+
+Settings = dict[str, str]
 
 
-def labels_of(found: Sequence[Configuration]) -> list[dict[str, str]]:
+def labels_of(found: Sequence[Configuration], unnamed: Sequence[str]) -> list[Settings]:
     """For each configuration the values of what not all have alike: its strategy, overrides, and what it ran with.
 
-    Keys are as short as tells them apart. A field of the row is left out where an override says the same.
+    That some lack an override on whose value the others agree is no difference, unless it alone tells configurations
+    apart: defaults and the constants of a sweep need no name. Keys and checkpoints are as short as tells them apart.
+
+    Args:
+        unnamed: overrides, or what they begin with up to a dot, that likewise count only where nothing else differs.
     """
     settings = [_settings(configuration) for configuration in found]
-    keys = dict.fromkeys(key for values in settings for key in values)
-    words = {key: {values.get(key) for values in settings} for key in keys}
-    # that a strategy has no K, say, is no more than its name says
-    several = [key for key in keys if len(words[key] - ({None} if key.startswith(ROW) else set())) > 1]
-    overridden = {_partition(settings, key) for key in several if not key.startswith(ROW)}
-    several = [key for key in several if not (key.startswith(ROW) and _partition(settings, key) in overridden)]
-    told = ["strategy", *(key for key in several if key != "strategy")]
-    short = _shortened(told)
-    return [{short[key]: values[key] for key in told if key in values} for values in settings]
+    keys = list(dict.fromkeys(key for values in settings for key in values if key != RUN))
+    twice = _told_twice(settings, keys)
+    where = [key for key in keys if any(f"{key}.".startswith(f"{name}.") for name in unnamed)]
+    named = [key for key in keys if key not in {*twice, *where}]
+    told = ["strategy", *_telling(settings, [key for key in named if key != "strategy"], [*twice, *where, RUN])]
+    short = _shortened(told, ".")
+    models = _shortened({values[CKPT] for values in settings if CKPT in values}, "/")
+    return [
+        {short[key]: models[values[key]] if key == CKPT else values[key] for key in told if key in values}
+        for values in settings
+    ]
 
 
-def _settings(configuration: Configuration) -> dict[str, str]:
-    values = {"strategy": configuration.row.strategy or "?"}
+def names_of(labels: Sequence[Settings]) -> list[str]:
+    """For each configuration of a panel its strategy, and as few labels as no other of that strategy has all."""
+    having: dict[tuple[str, str, str], int] = {}  # per strategy, key and value: a bit for each that has it
+    for number, values in enumerate(labels):
+        for item in values.items():
+            having[values["strategy"], *item] = having.get((values["strategy"], *item), 0) | 1 << number
+    names = []
+    for values in labels:
+        strategy, left = values["strategy"], [item for item in values.items() if item[0] != "strategy"]
+        alike, told = having[strategy, "strategy", strategy], []
+        while left and alike.bit_count() > 1:
+            told.append(min(left, key=lambda item: (alike & having[strategy, *item]).bit_count()))
+            left.remove(told[-1])
+            alike &= having[strategy, *told[-1]]
+        short = _shortened(values, ".")
+        names.append(
+            " ".join([strategy, *(f"{short[key]}={values[key]}" for key in values if (key, values[key]) in told)])
+        )
+    return names
+
+
+def _settings(configuration: Configuration) -> Settings:
+    row = configuration.row
+    values = {"strategy": row.strategy or "?"}
     for word in configuration.settings:
         key, _, value = word.lstrip("+").partition("=")
         if key != "strategy":
             values[key] = value
-    row = configuration.row
-    return values | {ROW + name: _said(value) for name in FIELDS if (value := getattr(row, name)) is not None}
+    fields = {ROW + name: _said(value) for name in FIELDS if (value := getattr(row, name)) is not None}
+    return values | fields | {RUN: row.run_id}
 
 
 def _said(value: object) -> str:
     return value[:DIGITS] if isinstance(value, str) and len(value) == 64 else str(value)
 
 
-def _partition(settings: Sequence[dict[str, str]], key: str) -> tuple[int, ...]:
-    """Which configurations have the same value: equal for two keys that tell the same apart."""
-    numbers: dict[str | None, int] = {}
-    return tuple(numbers.setdefault(values.get(key), len(numbers)) for values in settings)
+def _told_twice(settings: Sequence[Settings], keys: Sequence[str]) -> list[str]:
+    """Keys of which another says as much.
+
+    What it ran with says more than an override of that name, which may be `auto`, wherever that differs at all.
+    """
+    several = [key for key in keys if _differs(settings, key)]
+    ran = [key for key in several if key.startswith(ROW)]
+    twice = [key.removeprefix(ROW) for key in ran if key.removeprefix(ROW) in keys]
+    overridden = {_numbers(v.get(key) for v in settings) for key in several if key not in {*ran, *twice}}
+    for key in ran:
+        by = SETTLED_BY.get(key.removeprefix(ROW), ())
+        if _numbers(v.get(key) for v in settings) in overridden or (by and _settled(settings, key, by)):
+            twice.append(key)
+    return twice
 
 
-def _shortened(keys: Sequence[str]) -> dict[str, str]:
-    """Each key by its last part, with as many before it as it takes to be the only one."""
-    short = {key: key.rsplit(".", 1)[-1] for key in keys}
+def _settled(settings: Sequence[Settings], key: str, by: Sequence[str]) -> bool:
+    """Whether some have the overrides `by`, and these agree in `key` where they agree in them."""
+    known: dict[tuple, str | None] = {}
+    given = [values for values in settings if all(name in values for name in by)]
+    return bool(given) and all(
+        known.setdefault(tuple(values[name] for name in by), values.get(key)) == values.get(key) for values in given
+    )
+
+
+def _telling(settings: Sequence[Settings], keys: Sequence[str], spare: Sequence[str]) -> list[str]:
+    """The `keys` with several values; and of the others, then of `spare`, those that it takes to tell all apart."""
+    told = [key for key in keys if _differs(settings, key)]
+    known = _numbers(tuple(values.get(key) for key in ("strategy", *told)) for values in settings)
+    for key in [*(key for key in keys if key not in told), *spare]:
+        if len(set(known)) == len(settings):
+            break
+        finer = _numbers((number, values.get(key)) for number, values in zip(known, settings, strict=True))
+        if len(set(finer)) > len(set(known)):
+            told.append(key)
+            known = finer
+    return told
+
+
+def _differs(settings: Sequence[Settings], key: str) -> bool:
+    return len({values[key] for values in settings if key in values}) > 1
+
+
+def _numbers(values: Iterable[Hashable]) -> tuple[int, ...]:
+    """Each distinct value as a number, by first appearance: equal for two keys that tell the same apart."""
+    numbers: dict[Hashable, int] = {}
+    return tuple(numbers.setdefault(value, len(numbers)) for value in values)
+
+
+def _shortened(words: Iterable[str], separator: str) -> dict[str, str]:
+    """Each word by its last part, with as many before it as it takes to be the only one."""
+    short = {word: word.rstrip(separator).rsplit(separator, 1)[-1] for word in words}
     while clashing := [name for name, count in Counter(short.values()).items() if count > 1]:
-        longer = {k: ".".join(k.split(".")[-name.count(".") - 2 :]) for k, name in short.items() if name in clashing}
-        if all(short[key] == name for key, name in longer.items()):
+        longer = {
+            word: separator.join(word.split(separator)[-name.count(separator) - 2 :])
+            for word, name in short.items()
+            if name in clashing
+        }
+        if all(short[word] == name for word, name in longer.items()):
             break
         short |= longer
     return short

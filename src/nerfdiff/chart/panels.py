@@ -14,11 +14,13 @@ class Panel:
     """Configurations that were measured on one device, on the same images.
 
     Args:
+        cpu: whether the device is one.
         members: their numbers.
         views: test images of a scene, on average; None where it was not recorded.
     """
 
     device: str
+    cpu: bool
     data: str
     dataset: str | None
     image_size: tuple[int, ...]
@@ -43,7 +45,7 @@ def panels_of(found: Sequence[Configuration]) -> list[Panel]:
         row = found[members[0]].row
         views = row.n_views / row.n_scenes if row.n_views and row.n_scenes else None
         size = tuple(row.image_size or ())
-        panels.append(Panel(device, named[test], row.dataset, size, views, tuple(members)))
+        panels.append(Panel(device, row.device == "cpu", named[test], row.dataset, size, views, tuple(members)))
     return sorted(panels, key=lambda panel: -len(panel.members))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from nerfdiff.chart.frontier import frontier
-from nerfdiff.chart.labels import labels_of
+from nerfdiff.chart.labels import labels_of, names_of
 from nerfdiff.chart.panels import Panel, panels_of
 from nerfdiff.chart.pictures import links
 from nerfdiff.results.frame import Configuration, Run, newest
@@ -22,12 +22,15 @@ class Measured:
     """Configurations in the page's units, with the frontier of every panel, metric and cost.
 
     Args:
+        labels: per configuration, values of the settings in which those of its panel differ.
+        names: per configuration, as few of those settings as tell it from the others of its panel.
         estimates: per configuration, by field.
         frontiers: numbers of configurations by panel, then metric, then cost.
     """
 
     found: Sequence[Configuration]
     labels: Sequence[dict[str, str]]
+    names: Sequence[str]
     panels: Sequence[Panel]
     estimates: Sequence[dict[str, Estimate]]
     frontiers: Sequence[dict[str, dict[str, list[int]]]] = field(default_factory=list)
@@ -38,17 +41,22 @@ class Measured:
 
 
 def measured(
-    found: Sequence[Configuration], metrics: Sequence[Mapping[str, Any]], costs: Sequence[Mapping[str, Any]]
+    found: Sequence[Configuration],
+    metrics: Sequence[Mapping[str, Any]],
+    costs: Sequence[Mapping[str, Any]],
+    unnamed: Sequence[str],
 ) -> Measured:
-    """What there is to show of `metrics` and `costs`, which are those of conf/chart.yaml."""
+    """What there is to show of `metrics` and `costs`; these and `unnamed` are those of conf/chart.yaml."""
     scales = {metric["field"]: 1.0 for metric in metrics} | {cost["field"]: cost["scale"] for cost in costs}
     estimates = [_scaled(configuration.estimates, scales) for configuration in found]
     panels = panels_of(found)
     labels: list[dict[str, str]] = [{} for _ in found]
+    names = [""] * len(found)
     for panel in panels:  # what differs within a panel, not what makes it another
-        for number, told in zip(panel.members, labels_of([found[number] for number in panel.members]), strict=True):
-            labels[number] = told
-    content = Measured(found, labels, panels, estimates)
+        told = labels_of([found[number] for number in panel.members], unnamed)
+        for number, own, name in zip(panel.members, told, names_of(told), strict=True):
+            labels[number], names[number] = own, name
+    content = Measured(found, labels, names, panels, estimates)
     frontiers = [
         {
             metric["field"]: {
@@ -84,6 +92,7 @@ def configuration_values(content: Measured, number: int, page: Path) -> dict[str
     configuration, row = content.found[number], content.found[number].row
     fell_back = [run.row.error for run in configuration.runs if run.row.fallbacks and run.row.error]
     return {
+        "name": content.names[number],
         "labels": content.labels[number],
         "strategy": row.strategy,
         "overrides": configuration.settings,

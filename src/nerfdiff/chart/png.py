@@ -45,7 +45,7 @@ def write_png(
     best = content.frontiers[content.panels.index(panel)][metric["field"]][cost["field"]]
     points = content.points(panel, metric["field"], cost["field"])
     at = {n: (content.estimates[n][cost["field"]], content.estimates[n][metric["field"]]) for n in points}
-    told = [_told(number, content.labels[n], at[n], metric, cost) for number, n in enumerate(best, 1)]
+    told = [_told(number, content.names[n], at[n], metric, cost) for number, n in enumerate(best, 1)]
     told = [fill(text, int(LETTERS * size[0]), subsequent_indent="    ") for text in told]
     height = size[1] + LINE * sum(text.count("\n") + 1 for text in told)
     figure = Figure(figsize=(size[0], height), dpi=dpi, layout="constrained")
@@ -83,14 +83,13 @@ def _titled(quantity: Mapping[str, Any]) -> str:
 
 def _told(
     number: int,
-    labels: Mapping[str, str],
+    name: str,
     point: tuple[Estimate, Estimate],
     metric: Mapping[str, Any],
     cost: Mapping[str, Any],
 ) -> str:
-    words = [value if key == "strategy" else f"{key}={value}" for key, value in labels.items()]
     values = f"{point[1].mean:.{metric['digits']}f} {metric['unit']}".strip(), f"{point[0].mean:.3g} {cost['unit']}"
-    return f"{number}: {values[0]} at {values[1].strip()}: {' '.join(words)}"
+    return f"{number}: {values[0]} at {values[1].strip()}: {name}"
 
 
 def _steps(axes: Axes, places: Sequence[tuple[float, float]]) -> None:

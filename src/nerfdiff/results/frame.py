@@ -78,18 +78,19 @@ def read_runs(path: Path) -> list[Run]:
 
 
 def newest(runs: Sequence[Run]) -> list[Run]:
-    """The runs, oldest first, without those that were run again.
+    """The runs, oldest first, without those that were run again or stand in several files.
 
-    One that succeeded gives way to a later one that differs in nothing. One that failed gives way to any later attempt
-    with the same overrides, of which it may have seen too little to know more; but a later failure hides no success.
+    One that succeeded gives way to a later one that differs in nothing, wherever either lies. One that failed gives way
+    to any later attempt with the same overrides on its device, or on any where it failed before it had one: it may have
+    seen too little to know more. But a later failure hides no success.
     """
     kept: dict[tuple, Run] = {}
-    for run in runs:
-        attempt = (*_attempt(run), run.row.seed, run.row.overrides is None and run.row.run_id)
+    for run in sorted(runs, key=lambda run: run.row.time):
+        attempt = (_attempt(run), run.row.seed, run.row.overrides is None and run.row.run_id)
         for device in {run.device, None}:
             kept.pop((attempt, device), None)
         succeeded = run.row.status == "ok"
-        key = (_identity(run), run.home, run.row.seed) if succeeded else (attempt, run.device)
+        key = (_identity(run), run.row.seed) if succeeded else (attempt, run.device)
         kept.pop(key, None)
         kept[key] = run
     return list(kept.values())
@@ -105,11 +106,12 @@ class Configuration:
     """Runs that agree in everything but their seed, and succeeded.
 
     Args:
-        failed: how many more of them there are that did not.
+        failed: how many more of them there are that did not, on its device or before they had one.
         estimates: of what was measured (`QUALITIES` and `COSTS`), by the names of `ResultRow`. Qualities with values
             per scene: the mean over seeds and scenes and its bootstrap interval. Other qualities: the mean over
-            seeds and their range. Timings: the mean over seeds of the medians, and the ends of the quartiles around
-            them, of the lowest and the highest seed. Counts (per scene) and sizes: the mean over seeds and their range.
+            seeds and their range. Timings: the mean over seeds of the medians, and of median ± half the interquartile
+            range the lowest and the highest of any seed. Counts (per scene) and sizes: the mean over seeds and their
+            range.
     """
 
     runs: tuple[Run, ...]
@@ -142,11 +144,14 @@ def configurations(runs: Sequence[Run], bootstrap: Bootstrap) -> list[Configurat
         if run.row.status == "ok":
             groups.setdefault(_identity(run), []).append(run)
         else:
-            failures[_attempt(run)] = failures.get(_attempt(run), 0) + 1
-    return [
-        Configuration(tuple(members), failures.get(_attempt(members[0]), 0), _estimates(members, bootstrap))
-        for members in groups.values()
-    ]
+            key = (_attempt(run), run.device)
+            failures[key] = failures.get(key, 0) + 1
+    found = []
+    for members in groups.values():
+        attempt, devices = _attempt(members[0]), {members[0].device, None}
+        failed = sum(failures.get((attempt, device), 0) for device in devices)
+        found.append(Configuration(tuple(members), failed, _estimates(members, bootstrap)))
+    return found
 
 
 def configurations_frame(found: Sequence[Configuration]) -> pd.DataFrame:
@@ -176,8 +181,8 @@ def _identity(run: Run) -> str:
 
 
 def _attempt(run: Run) -> tuple:
-    """What is known of a run from its start, however early it failed."""
-    return run.home, run.settings, run.row.strategy
+    """What is known of a run from its start, however early it failed: its device may not be."""
+    return run.settings, run.row.strategy
 
 
 def _estimates(runs: Sequence[Run], bootstrap: Bootstrap) -> dict[str, Estimate]:

@@ -14,23 +14,23 @@ function mix(share) {
   return `rgb(${from.map((part, at) => Math.round(part + (to[at] - part) * (place - low))).join(",")})`;
 }
 
-// {word, colour, legend} of every value in the order of the legend, where not all stand; numbers along a scale, words by
-// kind, of which those beyond the colours are one.
+// {numeric, groups}, the groups in the order of the legend: numbers along a scale, of which not all stand there, or words
+// by kind, of which those beyond the colours are one.
 function colouring(numbers) {
   const found = [...new Set(numbers.map(colourValue))];
   const numeric = found.filter((word) => word !== UNSET && word !== "" && isFinite(word)).sort((a, b) => a - b);
+  const unset = found.includes(UNSET) ? [{ words: [UNSET], colour: OTHER, legend: UNSET }] : [];
   if (numeric.length > 1 && numeric.length >= found.filter((word) => word !== UNSET).length) {
     const every = Math.ceil((numeric.length - 1) / (TOLD - 1));
     const told = (at) => at % every === 0 || at === numeric.length - 1;
-    const scaled = numeric.map((word, at) => ({ word, colour: mix(at / (numeric.length - 1)), legend: told(at) ? word : null }));
-    return found.includes(UNSET) ? [...scaled, { word: UNSET, colour: OTHER, legend: UNSET }] : scaled;
+    const scaled = numeric.map((word, at) => ({ words: [word], colour: mix(at / (numeric.length - 1)), legend: told(at) ? word : null }));
+    return { numeric: true, groups: [...scaled, ...unset] };
   }
   const sorted = found.filter((word) => word !== UNSET).sort();
-  const kinds = sorted.map((word, at) => {
-    const legend = at < KINDS.length ? word : at === KINDS.length ? `${sorted.length - at} others` : null;
-    return { word, colour: KINDS[at] ?? OTHER, legend };
-  });
-  return found.includes(UNSET) ? [...kinds, { word: UNSET, colour: OTHER, legend: UNSET }] : kinds;
+  const kinds = sorted.slice(0, KINDS.length).map((word, at) => ({ words: [word], colour: KINDS[at], legend: word }));
+  const rest = sorted.slice(KINDS.length);
+  const others = rest.length ? [{ words: rest, colour: OTHER, legend: `${rest.length} others` }] : [];
+  return { numeric: false, groups: [...kinds, ...others, ...unset] };
 }
 
 function faint(colour, alpha) {

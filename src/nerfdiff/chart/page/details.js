@@ -52,7 +52,9 @@ function showConfiguration(number, seed = 0) {
   const failed = entry.failed ? bad(`${entry.failed} run${entry.failed > 1 ? "s" : ""} of this configuration failed.`) : null;
   const fell = entry.fell_back ? bad(entry.fell_back) : null;
   const pictures = picturesOf(run, seed === 0 ? entry.small : null);
-  panelOf(nameOf(number), failed, fell, seeds, ...pictures, commandOf(run), numbers(number), overrideList(entry));
+  const { strategy, ...others } = entry.labels;
+  const all = Object.entries(others).map(([key, word]) => `${key}=${word}`).join("  ");
+  panelOf(nameOf(number), element("p", { className: "words" }, all), failed, fell, seeds, ...pictures, commandOf(run), numbers(number), overrideList(entry));
 }
 
 function showFailure(entry) {
@@ -62,8 +64,10 @@ function showFailure(entry) {
   panelOf([entry.status, entry.strategy].filter(Boolean).join(": "), reason, note, commandOf(entry), overrideList(entry));
 }
 
+// Beside any device: failures before there was one, and on devices on which nothing succeeded.
 function drawFailures() {
-  const shown = data.failures.filter((entry) => !data.panels.length || entry.device === null || entry.device === panel().device);
+  const devices = data.panels.map(({ device }) => device);
+  const shown = data.failures.filter(({ device }) => !devices.includes(device) || device === panel().device);
   $("failed").hidden = !shown.length;
   $("failed-count").textContent = `(${shown.length})`;
   $("failed-strip").replaceChildren(...shown.map((entry) => {

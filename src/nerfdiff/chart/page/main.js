@@ -46,7 +46,8 @@ function remember() {
   history.replaceState(null, "", `#${new URLSearchParams(REMEMBERED.map((name) => [name, state[name]]))}`);
 }
 
-// The panel that the address asks for; what else it asks for is settled as any choice that is not there.
+// The panel that the address asks for, when the page opens and when the address changes; what else it asks for is settled
+// as any choice that is not there.
 function recall() {
   const asked = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
   for (const name of REMEMBERED.slice(1)) state[name] = asked[name] ?? state[name];
@@ -86,6 +87,7 @@ function connect() {
   };
   $("csv").onclick = saveCsv;
   wide.onchange = drawAll;
+  window.onhashchange = () => change({ panel: recall() }); // which remember() does not cause
   // opening the details narrows the plot, which Plotly sees only of windows
   new ResizeObserver(() => $("plot").on && Plotly.Plots.resize($("plot"))).observe($("plot-box"));
 }

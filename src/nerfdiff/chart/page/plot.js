@@ -33,23 +33,30 @@ function draw() {
   const timed = published.filter((entry) => entry.costs[state.cost] !== undefined);
   const untimed = published.filter((entry) => entry.costs[state.cost] === undefined);
   const costs = [...numbers.map((number) => mean(number, state.cost)), ...timed.map((entry) => entry.costs[state.cost])];
-  const bounds = (field) => ($("intervals").checked && !many() ? numbers.flatMap((number) => value(number, field)) : []);
+  const bounds = (field) => (intervals() ? numbers.flatMap((number) => value(number, field)) : []);
   const x = costAxis(costs, bounds(state.cost), untimed.length ? 0.08 : 0);
   const ends = [...numbers.map((number) => mean(number, state.metric)), ...bounds(state.metric)];
   const yaxis = metricAxis([...ends, ...published.map((entry) => entry.metrics[state.metric])]);
   const traces = [];
-  for (const { word, colour, legend } of colouring(numbers)) {
-    const group = numbers.filter((number) => colourValue(number) === word);
-    if (legend !== null) traces.push(legendEntry(word, colour, legend));
-    traces.push(pointTrace(group.filter((number) => !best.has(number)), word, colour, x, true));
-    traces.push(pointTrace(group.filter((number) => best.has(number)), word, colour, x, false));
+  const { numeric, groups } = colouring(numbers);
+  const colours = new Map(groups.flatMap(({ words, colour }) => words.map((word) => [word, colour])));
+  for (const { colour, legend } of groups) if (legend !== null) traces.push(legendEntry(colour, legend));
+  // a trace per kind, which its legend hides; one of all numbers, which may be thousands
+  for (const [name, words] of numeric ? [["all", [...colours.keys()]]] : groups.map(({ legend, words }) => [legend, words])) {
+    const own = new Set(words), group = numbers.filter((number) => own.has(colourValue(number)));
+    traces.push(pointTrace(group.filter((number) => !best.has(number)), name, colours, x, true));
+    traces.push(pointTrace(group.filter((number) => best.has(number)), name, colours, x, false));
   }
   traces.push(frontierTrace([...best], x), ring(x), ...publishedTraces(timed, untimed, x));
   const margin = marginFor(traces, published), { clientWidth, clientHeight } = $("plot");
   const size = [clientWidth - margin.l - margin.r, clientHeight - margin.t - margin.b];
   const layout = {
     xaxis: x.axis, yaxis, margin, hovermode: "closest", dragmode: WIDE() ? "zoom" : false, showlegend: true,
-    legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 0, itemclick: "toggle" }, paper_bgcolor: "#fff", plot_bgcolor: "#fff",
+    legend: {
+      orientation: "h", y: 1.02, yanchor: "bottom", x: 0, uirevision: `${state.panel} ${state.colour}`,
+      itemclick: numeric ? false : "toggle", itemdoubleclick: numeric ? false : "toggleothers",
+    },
+    paper_bgcolor: "#fff", plot_bgcolor: "#fff",
     font: { family: "system-ui, sans-serif", size: WIDE() ? 13 : 11, color: "#1d2430" },
     shapes: untimed.length ? [band(x)] : [],
     annotations: publishedLabels(timed, untimed, x, yaxis.range, size), uirevision: `${state.panel} ${state.metric} ${state.cost}`,
@@ -63,6 +70,9 @@ function draw() {
 function noteOn(numbers, published) {
   const all = panel().members.length, missing = all - numbers.length, notes = [];
   const what = `${costOf(state.cost).name} or ${metricOf(state.metric).name}`;
+  if (many()) notes.push(`Intervals of more than ${data.webgl_above} points are in the table only.`);
+  const memory = costOf(state.cost).on_cpu;
+  if (memory && panel().cpu) notes.push(`${costOf(state.cost).name}: ${memory}.`);
   if (missing) notes.push(`${missing} of ${all} configurations have no ${what}: they are in the table only.`);
   const sizes = [...new Set(published.map((entry) => `${entry.image_size} pixels`))].join(", ");
   if (published.some((entry) => !entry.same_size))
@@ -84,27 +94,31 @@ function bars(numbers, field, colour, at = (number) => number) {
   const above = found.map((values) => (values.length > 1 ? values[2] - values[0] : 0));
   // a bar down to zero has no end on a logarithmic axis: it ends at a hundredth
   const below = found.map((values) => (values.length > 1 ? values[0] - at(values[1]) : 0));
-  return { type: "data", symmetric: false, array: above, arrayminus: below, color: colour, thickness: 1.2, width: 3, visible: $("intervals").checked };
+  return { type: "data", symmetric: false, array: above, arrayminus: below, color: colour, thickness: 1.2, width: 3, visible: intervals() };
 }
 
 // Of its own, so that it is neither faint nor a ring.
-function legendEntry(word, colour, name) {
-  const marker = { color: colour, size: 10 };
-  return { type: "scatter", mode: "markers", name, legendgroup: word, x: [null], y: [null], marker, hoverinfo: "skip", meta: "legend" };
+function legendEntry(colour, name) {
+  const marker = { color: colour, size: 10 }, uid = uidOf("legend", name);
+  return { type: "scatter", mode: "markers", name, uid, legendgroup: name, x: [null], y: [null], marker, hoverinfo: "skip", meta: "legend" };
 }
 
+// What is hidden stays so by its uid, and no other group takes its place. Plotly wants one that can stand in a selector.
+const uidOf = (...parts) => [...[state.panel, state.colour, ...parts].join(" ")].map((letter) => letter.codePointAt(0)).join("-");
 const many = () => points().length > data.webgl_above;
+const intervals = () => $("intervals").checked && !many();
 
-function pointTrace(numbers, word, colour, x, dominated) {
-  const shade = dominated ? faint(colour, 0.3) : colour;
-  const bar = dominated ? faint(colour, 0.22) : colour;
+function pointTrace(numbers, name, colours, x, dominated) {
+  const own = numbers.map((number) => colours.get(colourValue(number)));
+  const one = new Set(own).size === 1 ? own[0] : "#5c6675"; // bars of a trace have one colour
+  const meta = dominated ? "dominated" : "frontier", bar = dominated ? faint(one, 0.22) : one;
   const symbol = numbers.map((number) => (data.configurations[number].failed ? "circle-open" : "circle"));
   const gl = many() && webgl;
   return {
-    type: gl ? "scattergl" : "scatter", mode: "markers", name: word, legendgroup: word, showlegend: false,
+    type: gl ? "scattergl" : "scatter", mode: "markers", name, uid: uidOf(meta, name), legendgroup: name, showlegend: false,
     x: numbers.map((number) => x.at(mean(number, state.cost))), y: numbers.map((number) => mean(number, state.metric)),
-    customdata: numbers, hoverinfo: "none", meta: dominated ? "dominated" : "frontier",
-    marker: { color: shade, size: dominated ? 8 : 11, symbol, line: { width: dominated ? 0 : 1.2, color: "#fff" } },
+    customdata: numbers, hoverinfo: "none", meta,
+    marker: { color: dominated ? own.map((colour) => faint(colour, 0.3)) : own, size: dominated ? 8 : 11, symbol, line: { width: dominated ? 0 : 1.2, color: "#fff" } },
     error_y: bars(numbers, state.metric, bar), error_x: bars(numbers, state.cost, bar, (low) => Math.max(low, 1e-12)),
   };
 }
@@ -113,7 +127,7 @@ function frontierTrace(numbers, x) {
   const at = numbers.map((number) => [x.at(mean(number, state.cost)), mean(number, state.metric)]);
   if (at.length) at.push([x.edge, at.at(-1)[1]]);
   return {
-    type: "scatter", mode: "lines", name: "frontier", showlegend: true, x: at.map(([cost]) => cost), y: at.map(([, quality]) => quality),
+    type: "scatter", mode: "lines", name: "frontier", uid: "step", showlegend: true, x: at.map(([cost]) => cost), y: at.map(([, quality]) => quality),
     line: { shape: "hv", color: "#1d2430", width: 1.6 }, hoverinfo: "skip", meta: "step",
   };
 }
@@ -121,7 +135,7 @@ function frontierTrace(numbers, x) {
 function ring(x) {
   const there = state.chosen !== null && both(state.chosen) && panel().members.includes(state.chosen);
   return {
-    type: "scatter", mode: "markers", name: "chosen", showlegend: false, hoverinfo: "skip", meta: "chosen",
+    type: "scatter", mode: "markers", name: "chosen", uid: "chosen", showlegend: false, hoverinfo: "skip", meta: "chosen",
     x: there ? [x.at(mean(state.chosen, state.cost))] : [], y: there ? [mean(state.chosen, state.metric)] : [],
     marker: { size: 19, color: "rgba(0,0,0,0)", line: { width: 2.5, color: "#1d2430" } },
   };
@@ -129,7 +143,7 @@ function ring(x) {
 
 function publishedTraces(timed, untimed, x) {
   const trace = (entries, place, meta, legend) => ({
-    type: "scatter", mode: "markers", name: "published", legendgroup: "published", showlegend: legend && entries.length > 0, meta,
+    type: "scatter", mode: "markers", name: "published", uid: uidOf(meta), legendgroup: "published", showlegend: legend && entries.length > 0, meta,
     x: entries.map(place), y: entries.map((entry) => entry.metrics[state.metric]), customdata: entries.map((entry) => ({ published: entry })),
     hoverinfo: "none", cliponaxis: false, marker: { symbol: "diamond-open", size: 10, color: "#6b4a00", line: { width: 1.6 } },
   });

@@ -21,10 +21,7 @@ function element(tag, properties = {}, ...children) {
   return made;
 }
 
-function nameOf(number) {
-  const { strategy, ...others } = data.configurations[number].labels;
-  return [strategy, ...Object.entries(others).map(([key, word]) => `${key}=${word}`)].filter(Boolean).join("  ");
-}
+const nameOf = (number) => data.configurations[number].name;
 
 function digits(number, unit) {
   if (number === 0) return "0";
@@ -45,7 +42,7 @@ function estimate(field, values) {
 // Overrides as a list: those that tell configurations apart first, in bold.
 function overrideList(entry) {
   const labels = entry.labels ?? {};
-  const told = (word) => Object.keys(labels).some((key) => word.split("=")[0].replace(/^\++/, "").endsWith(key));
+  const told = (word) => Object.keys(labels).some((key) => `.${word.split("=")[0].replace(/^\++/, "")}`.endsWith(`.${key}`));
   const all = words(entry);
   const lines = [...all.filter(told), ...all.filter((word) => !told(word))];
   return element("ul", { className: "words" }, ...lines.map((word) => element("li", {}, told(word) ? element("b", {}, word) : word)));

@@ -119,7 +119,7 @@ class PredictionWriter:
         Args:
             images: colours, clamped to [0, 1] and rounded to 8 bit here.
             depth: along z in scene units (see `depth.z_depth`); needs `opacity`.
-            cost: seconds and counts of this scene, and under which conditions, so that a resumed evaluation still knows them.
+            cost: seconds, counts and conditions of this scene, so that a resumed evaluation still knows them.
             status: `ok`, or why the method fell back to something else.
             beside: writes further files into the scene's folder, which appears only when they are there too.
 

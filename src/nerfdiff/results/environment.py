@@ -17,13 +17,13 @@ def environment(device: torch.device | str, precision: str | None = None) -> dic
         precision: the trainer's or the strategy's, e.g. "bf16-mixed".
     """
     device = torch.device(device)
-    return hardware(device) | {
+    versions = {
         "torch": str(torch.__version__),
         "cuda": torch.version.cuda if device.type == "cuda" else None,
-        "precision": precision,
         "lightning": version("lightning"),
         "hydra": version("hydra-core"),
-    } | git_state(Path(__file__).parent)
+    }
+    return hardware(device) | versions | {"precision": precision} | git_state(Path(__file__).parent)
 
 
 def hardware(device: torch.device) -> dict[str, str]:

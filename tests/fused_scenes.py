@@ -2,7 +2,7 @@
 
 import random
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -186,3 +186,27 @@ def _with_gradients(outputs, leaves, d_outputs, wanted):
     found = torch.autograd.grad(outputs, leaves, [d.to(o) for d, o in zip(d_outputs, outputs, strict=True)])
     there = [name for name in NAMES if name in wanted]
     return [o.detach().cpu() for o in outputs], {k: v.cpu() for k, v in zip(there, found, strict=True)}
+
+
+class BackendScene:
+    """A case with its field and rays where the kernels run."""
+
+    def __init__(self, dtype=torch.float32, **sizes):
+        self.case = Case(**{"n": 1, "uniform": 2, "importance": 2} | sizes)
+        self.leaves = [leaf.to(DEVICE, dtype) for leaf in self.case.leaves]
+        self.field, self.rays = self.case.field(self.leaves), self.case.rays(self.leaves)
+        self.jitter = self.case.jitter.to(DEVICE, dtype)
+        self.reference = self.case.renderer
+        self.triton = replace(self.reference, backend="triton")
+
+    def taken_over(self, caplog, why: str, **changes) -> None:
+        """The reference's numbers to the bit, and one line that says why, also when asked twice."""
+        given = {"field": self.field, "rays": self.rays, "jitter": self.jitter} | changes
+        expected = self.reference.render(**given)
+        for _ in range(2):
+            found = self.triton.render(**given)
+            for name in ("rgb", "opacity", "depth"):
+                assert torch.equal(getattr(found, name), getattr(expected, name))
+        assert [record.levelname for record in caplog.records] == ["WARNING"]
+        assert why in caplog.messages[0]
+        assert "reference takes over" in caplog.messages[0]

@@ -153,7 +153,7 @@ def differing(one, two) -> float:
     of whichever sign it was rounded to."""
     assert one.keys() == two.keys()
     far = [~torch.isclose(two[name].double(), value.double(), atol=2e-4, rtol=1e-3) for name, value in one.items()]
-    return torch.cat([one.flatten() for one in far]).double().mean().item()
+    return torch.cat([numbers.flatten() for numbers in far]).double().mean().item()
 
 
 def test_other_draws_train_something_else(data, tmp_path, whole):

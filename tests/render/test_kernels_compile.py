@@ -1,11 +1,10 @@
 """Kernels become machine code of a GPU that need not be there: what the interpreter runs must compile as well."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+
+from cross_compiling import compiled_for_hopper
 
 pytest.importorskip("triton.backends.nvidia")
 
@@ -27,13 +26,7 @@ MORE = 96
 
 
 def test_every_kernel_compiles_for_hopper_as_it_is_launched():
-    # a process of its own, since this one's kernels may be the interpreter's, and without the types' import hook
-    root = Path(__file__).parents[2]
-    script = root / "tests" / "render" / "compile_kernels.py"
-    environment = os.environ | {"PYTHONPATH": str(root / "src")}
-    done = subprocess.run([sys.executable, script, "90"], env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
-    lines = [line.split() for line in done.stdout.splitlines()]
+    lines = compiled_for_hopper(Path(__file__).with_name("compile_kernels.py"))
     assert {name for name, *_ in lines} == {name for name, _ in STACK} | {"cells_kernel", "merge_kernel"}
     assert all(int(size) > 1000 and int(shared) <= SHARED for *_, size, shared, _ in lines)
     for (kernel, precision), bounds in STACK.items():

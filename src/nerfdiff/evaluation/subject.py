@@ -34,7 +34,8 @@ class Subject:
         identity: what makes predictions comparable; other settings of it, other predictions.
         folder: of all that the run leaves.
         stability: of the model's training, see `LoadedModel`.
-        conditions: a digest of what does not change predictions but their cost: hardware, threads, scenes at once.
+        conditions: a digest of what changes what scenes cost, and their numbers by rounding at most: hardware, threads,
+            scenes at once, the renderer's chunks and the memory layout.
         data: where the scenes come from; None for a picture, whose other views nobody knows.
     """
 
@@ -180,8 +181,10 @@ def _subject(
         chunk=cfg.chunk or model.renderer.chunk,
         **samples,
     )
-    if channels_last(cfg.channels_last, device, cfg.compile != "none"):
+    in_pixels = channels_last(cfg.channels_last, device, cfg.compile != "none")
+    if in_pixels:
         model.to(memory_format=torch.channels_last)
     compile_unets(model, cfg.compile, cfg.paths.compiled_dir)
-    conditions = sha256_values([hardware(device), cfg.threads, cfg.scenes_at_once])[:8]
+    spent_on = [hardware(device), cfg.threads, cfg.scenes_at_once, model.renderer.chunk, in_pixels]
+    conditions = sha256_values(spent_on)[:8]
     return Subject(cfg, model, load, scene_ids, device, precision, identity, folder, loaded.stability, conditions, data)

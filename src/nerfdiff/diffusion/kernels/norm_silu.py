@@ -37,6 +37,18 @@ def sums_kernel(x, sums, pixels, C: tl.constexpr, CP: tl.constexpr, R: tl.conste
 
 @triton.jit
 @no_type_check
+def totals(sums, parts, C, channel, known):
+    """Both sums [parts, 2, C] of an image's parts, for each channel."""
+    first = tl.zeros(channel.shape, tl.float32)
+    second = tl.zeros(channel.shape, tl.float32)
+    for part in range(parts):
+        first += tl.load(sums + part * 2 * C + channel, mask=known, other=0.0)
+        second += tl.load(sums + part * 2 * C + C + channel, mask=known, other=0.0)
+    return first, second
+
+
+@triton.jit
+@no_type_check
 def coefficients_kernel(
     x, sums, weight, bias, scale_shift, coefficients, pixels, parts, eps,
     MODULATED: tl.constexpr, GROUPS: tl.constexpr, SIZE: tl.constexpr, SP: tl.constexpr,
@@ -54,12 +66,7 @@ def coefficients_kernel(
     channel = tl.arange(0, GROUPS)[:, None] * SIZE + member
     known = (member < SIZE) & (channel < C)
     pivot = tl.load(x + image * pixels * C + channel, mask=known, other=0.0).to(tl.float32)
-    first = tl.zeros([GROUPS, SP], tl.float32)
-    second = tl.zeros([GROUPS, SP], tl.float32)
-    sums += image * parts * 2 * C
-    for part in range(parts):
-        first += tl.load(sums + part * 2 * C + channel, mask=known, other=0.0)
-        second += tl.load(sums + part * 2 * C + C + channel, mask=known, other=0.0)
+    first, second = totals(sums + image * parts * 2 * C, parts, C, channel, known)
     count = 1.0 * SIZE * pixels
     mean = (tl.sum(pivot, 1) / SIZE + tl.sum(first, 1) / count)[:, None]
     away = tl.where(known, mean - pivot, 0.0)

@@ -10,6 +10,8 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
+from nerfdiff.diffusion.kernels.norm_silu import totals
+
 
 @triton.jit
 @no_type_check
@@ -66,12 +68,7 @@ def gradient_coefficients_kernel(
     member = tl.arange(0, SP)[None, :]
     channel = tl.arange(0, GROUPS)[:, None] * SIZE + member
     known = (member < SIZE) & (channel < C)
-    first = tl.zeros([GROUPS, SP], tl.float32)
-    second = tl.zeros([GROUPS, SP], tl.float32)
-    sums += image * parts * 2 * C
-    for part in range(parts):
-        first += tl.load(sums + part * 2 * C + channel, mask=known, other=0.0)
-        second += tl.load(sums + part * 2 * C + C + channel, mask=known, other=0.0)
+    first, second = totals(sums + image * parts * 2 * C, parts, C, channel, known)
     inverse = tl.load(coefficients + image * 4 * C + C + channel, mask=known, other=0.0)
     a = tl.load(coefficients + image * 4 * C + 2 * C + channel, mask=known, other=0.0)
     count = 1.0 * SIZE * pixels

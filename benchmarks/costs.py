@@ -11,7 +11,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from harness import Work
 from nerfdiff.cameras import Cameras
 from nerfdiff.model import NerfDiff, build_on_meta
-from nerfdiff.render.renderer import Renderer, Rendering
+from nerfdiff.render.renderer import Renderer
 
 NUMBER = 4
 """Bytes of the renderer's numbers: planes, rays and colours are fp32."""
@@ -98,10 +98,7 @@ def _denoise(model: NerfDiff, size: int, batch: int, views: int) -> Callable[[],
     with torch.device("meta"), torch.no_grad():
         encoding = _encoded(model, size, batch)
         cameras = Cameras(torch.empty(batch, views, 4, 4), torch.empty(batch, views, 3, 3), size, size)
-        shape = batch, views, size, size
-        condition = model.condition(
-            encoding, cameras, Rendering(torch.empty(*shape, 3), torch.empty(shape), torch.empty(shape))
-        )
+        condition = model.condition(encoding, cameras, torch.empty(batch, views, 3, size, size))
         z, t = torch.empty(batch * views, 3, size, size), torch.empty(batch * views)
 
     def call():

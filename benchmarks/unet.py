@@ -12,7 +12,6 @@ import torch
 
 import costs
 from harness import Row, Variant, interleaved, parser, settings_of
-from nerfdiff.render.renderer import Rendering
 from report import Report
 from subjects import Subject, scene, subject
 from variants import models
@@ -64,8 +63,7 @@ def _denoiser(measured: Subject, views: int, compiled: bool, seconds: float) -> 
     with measured.autocast():
         encoding = model.encode(one.source, one.source_cameras, one.near, one.far)
         settled = model.settled(encoding)
-    shape = 1, views, measured.size, measured.size
-    shown = Rendering(torch.rand(*shape, 3, device=measured.device), *torch.rand(2, *shape, device=measured.device))
+    shown = torch.rand(1, views, 3, measured.size, measured.size, device=measured.device)
     condition = model.condition(encoding, one.target_cameras, shown)
     z = torch.randn(views, 3, measured.size, measured.size, device=measured.device)
     t = torch.full((views,), 0.5, device=measured.device)

@@ -111,7 +111,7 @@ def test_both_losses_reach_the_image_encoder(name):
     encoding = made.encode(torch.rand(2, 3, 16, 16), input_cameras(2), *bounds(2))
     views = other_cameras(2)
     rendering = made.render(encoding, views)
-    condition = made.condition(encoding, views, rendering)
+    condition = made.condition(encoding, views, rendering.rgb.movedim(-1, 2))
     velocity = made.denoiser.velocity(torch.randn(4, 3, 16, 16), torch.full((4,), 0.5), condition)
     for loss in (rendering.rgb.square().sum(), velocity.square().sum()):
         made.zero_grad()

@@ -142,6 +142,7 @@ def check_resumable(path: str | Path, model_config: Mapping, accumulate: int) ->
     trained = checkpoint["hyper_parameters"]["model"]
     # before fields had names there was one kind of them
     trained = trained | {"field": {"name": TRIPLANE} | trained["field"]}
+    trained = trained | {"unet": {"patch": 1} | trained["unet"]}  # likewise before patches
     changed = [
         difference
         for difference in differences(trained, model_config, "model.")

@@ -201,7 +201,7 @@ def _step(model: NerfDiff, batch_size: int, target_views: int, height: int, widt
 
     encoding = model.encode(source, cameras, bounds, bounds)
     rendering = model.render(encoding, views, jitter)
-    condition = model.condition(encoding, views, rendering)
+    condition = model.condition(encoding, views, rendering.rgb.movedim(-1, 2))
     velocity = model.denoiser.velocity(targets, targets.new_empty(len(targets)), condition)
     (F.mse_loss(condition.rendered, targets) + F.mse_loss(velocity, targets)).backward()
 
@@ -234,7 +234,7 @@ def within_memory(
     automatic = unet["checkpointing"] == AUTO
     choices = [unet["checkpointing"]]
     if automatic:
-        most = [2**level for level in range(len(unet["channel_mult"]))]
+        most = [unet.get("patch", 1) * 2**level for level in range(len(unet["channel_mult"]))]
         # the largest images first: they hold the most, and cost no more to compute anew
         choices = [False, *(most[: count + 1] for count in range(len(most) - 1)), True]
     for choice in choices:

@@ -79,11 +79,13 @@ class NerfDiff(nn.Module):
         frustum = encoding.features
         return self.renderer.render_views(self.field(encoding), cameras, frustum.near, frustum.far, jitter)
 
-    def condition(self, encoding: Encoding, cameras: Cameras, rendering: Rendering) -> Condition:
-        """What the CDM sees of views [batch, views], flattened into one batch axis of batch · views."""
+    def condition(
+        self, encoding: Encoding, cameras: Cameras, rendered: Float[Tensor, "batch views 3 height width"]
+    ) -> Condition:
+        """What the CDM sees of views [batch, views] rendered in [0, 1], flattened into one axis of batch · views."""
         views = cameras.shape[1]
         return Condition(
-            rendered=rendering.rgb.flatten(0, 1).movedim(-1, 1),
+            rendered=rendered.flatten(0, 1),
             source=encoding.source[:, None].expand(-1, views, -1, -1, -1).flatten(0, 1),
             cameras=cameras.flatten(),
             near=encoding.features.near.repeat_interleave(views),

@@ -20,6 +20,7 @@ from nerfdiff.diffusion.unet import AUTO
 from nerfdiff.errors import CheckpointError, ConfigError
 from nerfdiff.memory import WEIGHTS_ADAM_EMA, is_tight, within_memory
 from nerfdiff.modules.nerfdiff_module import NerfDiffModule
+from nerfdiff.results.hashes import sha256_file, sha256_values
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +56,10 @@ def train(cfg: DictConfig) -> dict[str, float]:
         validation_times=plain(cfg.validation_times),
         channels_last=channels_last(cfg.channels_last, trainer.strategy.root_device, cfg.compile != "none"),
         seed=cfg.seed,
+        kept_renderings=_kept_renderings(cfg, datamodule),
     )
+    if cfg.init is not None and last is None:
+        module.model.load_state_dict(load_model(cfg.init, "ema", cfg.paths.assets_dir).model.state_dict())
     module.model.renderer = replace(module.model.renderer, backend=cfg.backend, kernel_precision=cfg.kernel_precision)
     compile_unets(module.model, cfg.compile, cfg.paths.compiled_dir)
     if trainer.is_global_zero:
@@ -73,6 +77,17 @@ def train(cfg: DictConfig) -> dict[str, float]:
         log.info("weights: %s", path)
         log.info("previews: %s   curves: tensorboard --logdir %s", output_dir / "previews", output_dir)
     return {name: float(value) for name, value in trainer.callback_metrics.items()}
+
+
+def _kept_renderings(cfg: DictConfig, data: SceneDataModule) -> str | None:
+    """The folder of a frozen field's renderings: its name says which field sees which data."""
+    if not cfg.kept_renderings:
+        return None
+    if cfg.init is None:
+        raise ConfigError("kept_renderings are of the field that init=<checkpoint> brings: set init, or it to null")
+    reader, init = data.reader("train"), load_model(cfg.init, "ema", cfg.paths.assets_dir)
+    what = [sha256_file(init.path), plain(cfg.model.render), reader.identity, reader.fingerprint()]
+    return str(Path(cfg.kept_renderings) / sha256_values(what)[:12])
 
 
 def _within_memory(model_config: dict, trainer: Trainer, data: SceneDataModule) -> dict:

@@ -113,3 +113,10 @@ def test_the_shift_of_reconstructed_inputs_has_the_wanted_variance_and_depends_o
         shifts[17]
     )
     assert Draws(seed=5, scenes=7, target_views=1, source_as_target=0.5).shift(17) is None
+
+
+def test_sources_can_be_kept_to_a_scenes_first_views():
+    draws = Draws(seed=3, scenes=2, target_views=3, source_as_target=0.2, source_views=2)
+    chosen = [draws.views(draw, 6) for draw in range(400)]
+    assert {source for source, _ in chosen} == {0, 1}
+    assert {target for _, targets in chosen for target in targets} == set(range(6))

@@ -31,7 +31,7 @@ def views() -> Cameras:
 def condition_of(net, source):
     bounds = torch.tensor([0.8]), torch.tensor([1.8])
     encoding = net.encode(source, input_cameras(1), *bounds)
-    return net.condition(encoding, views(), net.render(encoding, views()))
+    return net.condition(encoding, views(), net.render(encoding, views()).rgb.movedim(-1, 2))
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -82,7 +82,7 @@ def test_a_settled_encoding_conditions_as_the_encoding_itself(variant):
         wanted = Cameras(views().c2w.expand(2, 2, 4, 4), views().K.expand(2, 2, 3, 3), 16, 16)
         rendering, z = net.render(encoding, wanted), torch.randn(4, 3, 16, 16)
         plain, settled = (
-            net.denoiser(z, torch.full((4,), 0.5), net.condition(known, wanted, rendering))
+            net.denoiser(z, torch.full((4,), 0.5), net.condition(known, wanted, rendering.rgb.movedim(-1, 2)))
             for known in (encoding, net.settled(encoding))
         )
     torch.testing.assert_close(settled, plain, atol=1e-4, rtol=1e-4)

@@ -208,3 +208,27 @@ def test_there_must_be_levels_to_reuse():
 def test_a_width_groupnorm_cannot_split_is_refused():
     with pytest.raises(ValueError, match="multiple of 32"):
         unet(width=40)
+
+
+def test_patches_move_the_work_to_smaller_images():
+    """A U-Net on patches of 2 pixels is the plain one on images of half the side and four times the channels."""
+    plain = UNet(12, 20, **SMALL, with_time=True, cross_attention=False, zero_output=False)
+    on_patches = unet(patch=2, attention_downsampling=[2 * d for d in SMALL["attention_downsampling"]])
+    on_patches.load_state_dict(plain.state_dict())
+    x, t = torch.randn(2, 3, 16, 24), torch.rand(2)
+    out, features = on_patches(x, t)
+    # channel c of the small image at (row i, column j of the patch) is channel 4c + 2i + j
+    small = torch.stack([x[:, :, i::2, j::2] for i in (0, 1) for j in (0, 1)], 2).flatten(1, 2)
+    expected, expected_features = plain(small, t)
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        torch.testing.assert_close(out[:, :, i::2, j::2], expected[:, 2 * i + j :: 4], atol=1e-5, rtol=1e-5)
+    assert [f.shape for f in features] == [f.shape for f in expected_features]
+
+
+def test_patches_are_whole_and_levels_count_from_the_input():
+    with pytest.raises(ConfigError, match=r"model\.unet\.patch=2: images of 15x20 pixels are not made of whole patches"):
+        unet(patch=2, attention_downsampling=[4])(torch.randn(1, 3, 15, 20), torch.rand(1))
+    with pytest.raises(ConfigError, match=r"model\.unet\.patch=0"):
+        unet(patch=0)
+    with pytest.raises(ConfigError, match=r"some of \[2, 4\]"):
+        unet(patch=2, checkpointing=[1])

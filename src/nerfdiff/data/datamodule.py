@@ -36,6 +36,8 @@ class SceneDataModule(LightningDataModule):
         reader: makes the reader of a split, as `reader(root=..., split=..., image_size=...)`.
         train_scenes: how many scenes to train on, spread evenly over the split (None: all).
         train_source_view: number of the view that every draw takes as its source (None: any view).
+        train_source_views: sources are among so many first views of a scene (None: any view), so that a frozen field
+            has fewer renderings to keep.
         target_views: T, target views per training draw.
         source_as_target: probability that a draw's first target is its source view.
         source_target_noise: variance of the noise on the camera position of such a target, in squared scene units
@@ -64,6 +66,7 @@ class SceneDataModule(LightningDataModule):
         reader: Callable[..., SceneReader],
         train_scenes: int | None,
         train_source_view: int | None,
+        train_source_views: int | None,
         target_views: int,
         source_as_target: float,
         source_target_noise: float,
@@ -107,6 +110,7 @@ class SceneDataModule(LightningDataModule):
         self.name, self.make_reader = name, reader
         self.root, self.image_size, self.background = root, image_size, background
         self.train_scenes, self.train_source_view = train_scenes, train_source_view
+        self.train_source_views = train_source_views
         self.target_views, self.source_as_target = target_views, source_as_target
         self.source_target_noise = source_target_noise
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
@@ -177,7 +181,14 @@ class SceneDataModule(LightningDataModule):
                 f"trainer.accumulate_grad_batches={accumulate}"
             )
         scenes = len(spread(len(self.train_reader), self.train_scenes))
-        draws = Draws(self.seed, scenes, self.target_views, self.source_as_target, self.source_target_noise)
+        draws = Draws(
+            self.seed,
+            scenes,
+            self.target_views,
+            self.source_as_target,
+            self.source_target_noise,
+            self.train_source_views,
+        )
         sampler = DrawSampler(
             self.batch_size,
             micro_batch_size,

@@ -37,6 +37,7 @@ class Draws:
         source_as_target: probability that the first target is the source view itself; apart from that,
             targets are never the source.
         source_target_noise: variance of the noise on the position of such a target's camera, in squared scene units.
+        source_views: sources are among so many first views of a scene (None: any view).
     """
 
     seed: int
@@ -44,6 +45,7 @@ class Draws:
     target_views: int
     source_as_target: float
     source_target_noise: float = 0.0
+    source_views: int | None = None
 
     def scene(self, draw: int) -> int:
         """Index of the draw's scene."""
@@ -58,7 +60,8 @@ class Draws:
         """
         bits = random_bits(self.seed, VIEWS, draw, views + 1)
         order = np.argsort(bits[:views], kind="stable").tolist()
-        source = order[0] if source is None else source
+        if source is None:
+            source = next(view for view in order if self.source_views is None or view < self.source_views)
         targets = [view for view in order if view != source][: self.target_views]
         if bits[views] < self.source_as_target * 2.0**64:
             targets[0] = source

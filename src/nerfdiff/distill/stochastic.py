@@ -76,4 +76,4 @@ def _condition(views: VirtualViews, encoding: Encoding, known: int, view: int) -
         wanted = wanted.relative_to(views.cameras[:, known - 1 : known])
     with timed("guide"):
         rendering = views.model.render(encoding, wanted)
-    return views.model.condition(encoding, wanted, rendering)
+    return views.model.condition(encoding, wanted, rendering.rgb.movedim(-1, 2))

@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Mapping
+from contextlib import nullcontext
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -10,12 +12,19 @@ from jaxtyping import Float
 from lightning import LightningModule
 from torch import Tensor
 
+from nerfdiff.cameras import Rays
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.diffusion.schedule import add_noise, alpha_sigma, expand, v_from_x0_eps
 from nerfdiff.errors import ConfigError
+from nerfdiff.field.encoder import Encoding
+from nerfdiff.field.triplane import Triplane
 from nerfdiff.metrics.image import psnr
 from nerfdiff.model import NerfDiff
+from nerfdiff.modules.kept_renderings import KeptRenderings
 from nerfdiff.randomness import generator, spread_times
+
+WHOLE = {"ray_share": 1.0, "through_rendering": True}
+"""The paper's joint loss, which checkpoints from before there was another have."""
 
 
 class NerfDiffModule(LightningModule):
@@ -23,12 +32,19 @@ class NerfDiffModule(LightningModule):
 
     Args:
         model: arguments of `NerfDiff`, as plain data.
-        losses: `lambda_ic` and `lambda_dm`.
+        losses: `lambda_ic` and `lambda_dm`, 0 for a part that is not trained: without L^DM the field alone is, without
+            L^IC the CDM alone, on the renderings of a field that stays as it is. `ray_share`: L^IC is measured on so
+            many of a target's rays, drawn anew at every step. `through_rendering`: the gradient of L^DM flows back
+            through the rendering into the field (paper).
         optimizer: AdamW's `lr`, `weight_decay`, `betas`; `warmup_steps` of linear warm-up; `decay` is `none` or
             `cosine`, to zero at the end of training.
         validation_times: times t at which the denoising loss is measured on held-out views.
         channels_last: memory layout of the U-Nets.
         seed: of all noise; see `nerfdiff.randomness`.
+        kept_renderings: folder where a frozen field's renderings are kept, instead of being made at every step.
+
+    Raises:
+        ConfigError: losses that train nothing, or that ask for gradients which are not computed.
     """
 
     def __init__(
@@ -39,21 +55,39 @@ class NerfDiffModule(LightningModule):
         validation_times: list[float],
         channels_last: bool,
         seed: int,
+        kept_renderings: str | None = None,
     ):
         super().__init__()
-        self.save_hyperparameters()
+        losses = WHOLE | losses
+        _check_losses(losses, kept_renderings)
+        self.save_hyperparameters(ignore=["kept_renderings"])
         self.model = NerfDiff(**model)
+        self.frozen_field = losses["lambda_ic"] == 0
+        self.kept = KeptRenderings(kept_renderings) if kept_renderings else None
+        if self.frozen_field:
+            self.model.encoder.requires_grad_(False)
+            self.model.decoder.requires_grad_(False)
+        if losses["lambda_dm"] == 0:
+            self.model.denoiser.requires_grad_(False)
         self.image_size: list[int] | None = None  # of the training images, once one was seen
         if channels_last:
             self.model.to(memory_format=torch.channels_last)
 
     def training_step(self, batch: ViewBatch, batch_idx: int) -> Tensor:
         self.image_size = list(batch.targets.shape[-2:])
-        noise = self._noise(batch)
-        times = spread_times(batch.draws, self.hparams.seed)
-        loss_ic, loss_dm = self._losses(batch, times, **noise)
-        loss = self.hparams.losses["lambda_ic"] * loss_ic + self.hparams.losses["lambda_dm"] * loss_dm
-        values = {"loss": loss, "loss_ic": loss_ic, "loss_dm": loss_dm, "psnr": _psnr_of_mse(loss_ic)}
+        losses = WHOLE | self.hparams.losses
+        encode = torch.no_grad() if self.frozen_field else nullcontext()
+        with encode:
+            encoding = self.model.encode(batch.source, batch.source_cameras, batch.near, batch.far)
+        noise = self._noise(batch, losses)
+        loss_ic, rendering = self._photometric(batch, encoding, noise, losses)
+        loss = losses["lambda_ic"] * loss_ic
+        values = {"loss_ic": loss_ic, "psnr": _psnr_of_mse(loss_ic)}
+        if losses["lambda_dm"]:
+            loss_dm = self._diffusion(batch, encoding, rendering, noise["eps"])
+            loss = loss + losses["lambda_dm"] * loss_dm
+            values["loss_dm"] = loss_dm
+        values["loss"] = loss
         size = len(batch)
         self.log_dict({f"train/{name}": value.detach() for name, value in values.items()}, batch_size=size)
         self.log("psnr", values["psnr"].detach(), prog_bar=True, logger=False, batch_size=size)
@@ -71,7 +105,7 @@ class NerfDiffModule(LightningModule):
             batch_size=len(batch),
             sync_dist=True,
         )
-        condition = self.model.condition(encoding, batch.target_cameras, rendering)
+        condition = self.model.condition(encoding, batch.target_cameras, rendered)
         targets = 2 * batch.targets.flatten(0, 1) - 1
         eps = torch.randn(targets.shape, generator=generator("cpu", self.hparams.seed, "validation", batch_idx))
         losses = [
@@ -86,7 +120,8 @@ class NerfDiffModule(LightningModule):
         if decay not in ("none", "cosine"):
             raise ConfigError(f"optimizer.decay must be none or cosine, got {decay!r}")
         options["betas"] = tuple(options["betas"])
-        optimizer = torch.optim.AdamW(self.model.parameters(), **options)
+        trained = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
+        optimizer = torch.optim.AdamW(trained, **options)
         total = self.trainer.max_steps
 
         def factor(step: int) -> float:
@@ -111,15 +146,73 @@ class NerfDiffModule(LightningModule):
         checkpoint["accumulate_grad_batches"] = self.trainer.accumulate_grad_batches
         checkpoint["image_size"] = self.image_size
 
-    def _losses(self, batch: ViewBatch, times: Tensor, jitter: Tensor, eps: Tensor) -> tuple[Tensor, Tensor]:
-        """(L^IC, L^DM) of the paper's eqs. "pixelnerf" and "ddpm", the latter on v."""
-        encoding = self.model.encode(batch.source, batch.source_cameras, batch.near, batch.far)
-        rendering = self.model.render(encoding, batch.target_cameras, jitter)
-        loss_ic = F.mse_loss(rendering.rgb.movedim(-1, 2), batch.targets)
-        condition = self.model.condition(encoding, batch.target_cameras, rendering)
+    def _photometric(
+        self, batch: ViewBatch, encoding: Encoding, noise: dict[str, Tensor], losses: Mapping
+    ) -> tuple[Tensor, Float[Tensor, "batch targets 3 height width"] | None]:
+        """L^IC (paper, eq. "pixelnerf"), and the images that the CDM is to see (None: it is not trained)."""
+        if self.frozen_field:
+            with torch.no_grad():
+                rendered = self._rendered(batch, encoding)
+            return F.mse_loss(rendered, batch.targets), rendered
+        whole = losses["ray_share"] == 1
+        if whole:
+            rendered = self.model.render(encoding, batch.target_cameras, noise["jitter"]).rgb.movedim(-1, 2)
+            loss_ic = F.mse_loss(rendered, batch.targets)
+        else:
+            loss_ic = self._on_some_rays(batch, encoding, noise["rays"], noise["jitter"])
+        if not losses["lambda_dm"]:
+            return loss_ic, None
+        if whole:
+            return loss_ic, rendered if losses["through_rendering"] else rendered.detach()
+        with torch.no_grad():
+            return loss_ic, self._rendered(batch, encoding)
+
+    def _on_some_rays(self, batch: ViewBatch, encoding: Encoding, rays: Tensor, jitter: Tensor) -> Tensor:
+        """L^IC on rays [batch, n], numbered over all pixels of all targets of a draw."""
+        bounds = encoding.features
+        every = batch.target_cameras.rays(bounds.near[:, None], bounds.far[:, None])
+        shape = every.directions.shape[:-1]
+        some = Rays(
+            *(
+                torch.stack([of_one.flatten(0, 2)[index] for of_one, index in zip(part, rays, strict=True)])
+                for part in (
+                    every.origins.expand(*shape, 3),
+                    every.directions,
+                    every.near.expand(shape),
+                    every.far.expand(shape),
+                )
+            )
+        )
+        rgb = self.model.renderer.render(self.model.field(encoding), some, jitter).rgb
+        colours = batch.targets.movedim(2, -1).flatten(1, 3)
+        return F.mse_loss(rgb, torch.stack([one[index] for one, index in zip(colours, rays, strict=True)]))
+
+    def _rendered(self, batch: ViewBatch, encoding: Encoding) -> Float[Tensor, "batch targets 3 height width"]:
+        """Whole targets without gradients or jitter; a frozen field's are kept."""
+        if self.kept is None:
+            return self.model.render(encoding, batch.target_cameras).rgb.movedim(-1, 2)
+        images = []
+        for draw, (scene, source, targets) in enumerate(
+            zip(batch.scene_ids, batch.source_views, batch.target_views, strict=True)
+        ):
+            one = slice(draw, draw + 1)
+            triplane = encoding.triplane
+            alone = Triplane(triplane.planes[one], triplane.cameras[one], triplane.near[one], triplane.far[one])
+            own = replace(encoding, source=encoding.source[one], features=alone)
+
+            def render(views: list[int], own: Encoding = own, one: slice = one) -> Tensor:
+                return self.model.render(own, batch.target_cameras[one, views]).rgb[0].movedim(-1, 1)
+
+            names = [f"{scene}/{source}/{target}" for target in targets]
+            images.append(self.kept.get(names, tuple(batch.targets.shape[-2:]), render))
+        return torch.stack(images).to(batch.targets)
+
+    def _diffusion(self, batch: ViewBatch, encoding: Encoding, rendered: Tensor, eps: Tensor) -> Tensor:
+        """L^DM (paper, eq. "ddpm") on v."""
+        condition = self.model.condition(encoding, batch.target_cameras, rendered)
         targets = 2 * batch.targets.flatten(0, 1) - 1
-        times = times.repeat_interleave(batch.target_cameras.shape[1])
-        return loss_ic, self._denoising_loss(condition, targets, eps.flatten(0, 1), times)
+        times = spread_times(batch.draws, self.hparams.seed).repeat_interleave(batch.target_cameras.shape[1])
+        return self._denoising_loss(condition, targets, eps.flatten(0, 1), times)
 
     def _denoising_loss(
         self, condition, x0: Float[Tensor, "batch 3 height width"], eps: Tensor, t: Float[Tensor, "batch"]
@@ -128,16 +221,36 @@ class NerfDiffModule(LightningModule):
         predicted = self.model.denoiser.velocity(add_noise(x0, eps, alpha, sigma), t, condition)
         return F.mse_loss(predicted, v_from_x0_eps(x0, eps, alpha, sigma))
 
-    def _noise(self, batch: ViewBatch) -> dict[str, Tensor]:
-        """ε and the ray jitter of every training item, each a function of its draw alone."""
+    def _noise(self, batch: ViewBatch, losses: Mapping) -> dict[str, Tensor]:
+        """ε, the chosen rays and the ray jitter of every training item, each a function of its draw alone."""
         targets = batch.targets
         samples = self.model.renderer.samples_per_ray
         rays = targets.shape[1] * targets.shape[-2] * targets.shape[-1]
+        some = max(1, round(losses["ray_share"] * rays))
         generators = [generator(self.device, self.hparams.seed, "noise", int(d)) for d in batch.draws.tolist()]
-        return {
-            "jitter": torch.stack([torch.rand(rays, samples, generator=g, device=g.device) for g in generators]),
-            "eps": torch.stack([torch.randn(targets.shape[1:], generator=g, device=g.device) for g in generators]),
-        }
+        noise = {}
+        if not self.frozen_field:
+            noise["jitter"] = torch.stack([torch.rand(some, samples, generator=g, device=g.device) for g in generators])
+        if losses["lambda_dm"]:
+            noise["eps"] = torch.stack([torch.randn(targets.shape[1:], generator=g, device=g.device) for g in generators])
+        if some < rays:
+            noise["rays"] = torch.stack([torch.randperm(rays, generator=g, device=g.device)[:some] for g in generators])
+        return noise
+
+
+def _check_losses(losses: Mapping, kept_renderings: str | None) -> None:
+    ic, dm, share = losses["lambda_ic"], losses["lambda_dm"], losses["ray_share"]
+    if ic < 0 or dm < 0 or ic == dm == 0:
+        raise ConfigError(f"losses.lambda_ic={ic}, lambda_dm={dm}: neither may be negative, nor both be 0")
+    if not 0 < share <= 1:
+        raise ConfigError(f"losses.ray_share={share}: expected a share above 0, at most 1")
+    if losses["through_rendering"] and ic and dm and share < 1:
+        raise ConfigError(
+            f"losses.ray_share={share} renders some of the rays with gradients, and the CDM's gradient needs them all: "
+            "set losses.through_rendering=false, or losses.ray_share=1"
+        )
+    if kept_renderings and ic:
+        raise ConfigError("kept_renderings are of a field that does not change: set losses.lambda_ic=0, or it to null")
 
 
 def _psnr_of_mse(mse: Tensor) -> Tensor:

@@ -1,0 +1,156 @@
+"""A field alone on some rays, then the CDM alone on its kept renderings."""
+
+import shutil
+import sqlite3
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from model_fixtures import config
+from nerfdiff.checkpoint import load_model
+from nerfdiff.data.batch import ViewBatch
+from nerfdiff.errors import CheckpointError, ConfigError
+from nerfdiff.modules.kept_renderings import KeptRenderings
+from nerfdiff.modules.nerfdiff_module import NerfDiffModule
+from training_fixtures import last_checkpoint, run_training, write_dataset
+
+OPTIMIZER = {"lr": 1e-3, "weight_decay": 0.0, "betas": [0.9, 0.99], "warmup_steps": 0, "decay": "none"}
+FIELD = ["losses.lambda_dm=0", "losses.through_rendering=false", "losses.ray_share=0.25"]
+
+
+def module(losses, **options) -> NerfDiffModule:
+    torch.manual_seed(0)
+    made = NerfDiffModule(config(), {"lambda_ic": 1, "lambda_dm": 1} | losses, OPTIMIZER, [0.5], False, 0, **options)
+    made.log = made.log_dict = lambda *args, **kwargs: None
+    torch.nn.init.normal_(made.model.denoiser.unet.conv_out.weight, std=0.1)  # else no gradient gets past it
+    return made
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return write_dataset(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture(scope="module")
+def batch(data) -> ViewBatch:
+    from nerfdiff.data.draws import Draws
+    from nerfdiff.data.srn import SRNReader
+    from nerfdiff.data.views import TrainingViews
+
+    reader = SRNReader(root=data, split="train", image_size=[8, 8], category="cars", near=0.8, far=1.8)
+    views = TrainingViews(reader, Draws(0, len(reader), 2, 0.0))
+    return ViewBatch.collate([views[draw] for draw in range(2)])
+
+
+def gradients(made: NerfDiffModule, batch: ViewBatch) -> dict[str, torch.Tensor]:
+    made.training_step(batch, 0).backward()
+    return {name: p.grad for name, p in made.model.named_parameters() if p.grad is not None}
+
+
+def parts(names) -> set[str]:
+    return {name.partition(".")[0] for name in names}
+
+
+def test_each_part_can_be_trained_alone(batch):
+    assert parts(gradients(module({"lambda_dm": 0}), batch)) == {"encoder", "decoder"}
+    assert parts(gradients(module({"lambda_ic": 0}), batch)) == {"denoiser"}
+
+
+def test_all_rays_in_another_order_give_the_same_loss(batch):
+    made = module({"lambda_dm": 0})
+    encoding = made.model.encode(batch.source, batch.source_cameras, batch.near, batch.far)
+    every = torch.stack([torch.randperm(2 * 64, generator=torch.Generator().manual_seed(seed)) for seed in (1, 2)])
+    jitter = torch.full((2, 128, made.model.renderer.samples_per_ray), 0.5)
+    some = made._on_some_rays(batch, encoding, every, jitter)
+    rendered = made.model.render(encoding, batch.target_cameras, jitter).rgb.movedim(-1, 2)
+    torch.testing.assert_close(some, F.mse_loss(rendered, batch.targets))
+    # a ray's own colour: the loss on one ray is that pixel's error
+    one = made._on_some_rays(batch, encoding, torch.tensor([[70], [70]]), jitter[:, :1])
+    view, pixel = divmod(70, 64)
+    error = (rendered - batch.targets)[:, view, :, pixel // 8, pixel % 8]
+    torch.testing.assert_close(one, error.square().mean())
+
+
+def test_without_the_way_through_the_rendering_the_field_has_no_gradient_of_the_cdm(batch):
+    """The photometric loss is the same, so what differs in the encoder is the CDM's part."""
+    through, apart = (gradients(module({"through_rendering": way}), batch) for way in (True, False))
+    name = "decoder.output.weight"  # the encoder also gets the CDM's gradient by cross-attention
+    alone = gradients(module({"lambda_dm": 0}), batch)
+    torch.testing.assert_close(apart[name], alone[name])
+    assert not torch.allclose(through[name], alone[name])
+
+
+def test_kept_renderings_are_what_would_be_rendered(batch, tmp_path):
+    plain, keeping = module({"lambda_ic": 0}), module({"lambda_ic": 0}, kept_renderings=str(tmp_path))
+    encoding = plain.model.encode(batch.source, batch.source_cameras, batch.near, batch.far)
+    with torch.no_grad():
+        rendered = plain._rendered(batch, encoding)
+        first, second = keeping._rendered(batch, encoding), keeping._rendered(batch, encoding)
+    torch.testing.assert_close(first, rendered, atol=0.5 / 255 + 1e-5, rtol=0)
+    assert torch.equal(first, second)
+    with sqlite3.connect(keeping.kept.path) as file:
+        assert file.execute("SELECT count(*) FROM renderings").fetchone() == (4,)
+
+
+def test_kept_renderings_are_made_once(tmp_path):
+    made = []
+
+    def render(missing):
+        made.append(missing)
+        return torch.stack([torch.full((3, 2, 4), position / 4) for position in missing])
+
+    kept = KeptRenderings(tmp_path)
+    kept.get(["a", "b"], (2, 4), render)
+    again = KeptRenderings(tmp_path).get(["b", "c", "a"], (2, 4), render)
+    assert made == [[0, 1], [1]]
+    assert (again[:, 0, 0, 0] * 4).round().tolist() == [1, 1, 0]
+    with pytest.raises(CheckpointError, match=r"renderings\.sqlite.*delete this folder"):
+        kept.get(["a"], (3, 3), render)
+
+
+@pytest.mark.parametrize(
+    ("losses", "message"),
+    [
+        ({"lambda_ic": 0, "lambda_dm": 0}, "nor both be 0"),
+        ({"ray_share": 0}, "expected a share above 0"),
+        ({"ray_share": 0.5}, r"losses\.through_rendering=false"),
+    ],
+)
+def test_losses_that_cannot_be(losses, message):
+    with pytest.raises(ConfigError, match=message):
+        module(losses)
+
+
+def test_two_phases_as_a_person_runs_them(data, tmp_path):
+    field = tmp_path / "field"
+    run_training(data, field, *FIELD)
+    more = ["losses.lambda_ic=0", f"init={field}", f"kept_renderings={tmp_path / 'kept'}", "data.train_source_views=1"]
+    run_training(data, tmp_path / "cdm", *more)
+    before, after = (load_model(run, "raw", "assets").model.state_dict() for run in (field, tmp_path / "cdm"))
+    averaged = load_model(field, "ema", "assets").model.state_dict()
+    for name, value in after.items():
+        if name.startswith("denoiser.unet.conv_out"):
+            assert not torch.equal(value, before[name])  # trained
+        elif not name.startswith("denoiser"):
+            assert torch.equal(value, averaged[name]), name  # the field as it was given
+    (kept,) = (tmp_path / "kept").glob("*/renderings.sqlite")
+    with sqlite3.connect(kept) as file:
+        names = [name for (name,) in file.execute("SELECT name FROM renderings")]
+    assert names and all(name.split("/")[1] == "000000" for name in names)  # one source view of each scene
+
+    # stopped and resumed: the same bits, whatever is kept already
+    half = tmp_path / "half"
+    run_training(data, half, *more, "trainer.max_steps=3")
+    shutil.rmtree(tmp_path / "kept")
+    run_training(data, half, *more)
+    whole, resumed = last_checkpoint(tmp_path / "cdm"), last_checkpoint(half)
+    for name, value in whole["current_model_state"].items():
+        assert torch.equal(value, resumed["current_model_state"][name]), name
+
+
+def test_kept_renderings_need_a_field_that_stays(data, tmp_path):
+    with pytest.raises(ConfigError, match="init=<checkpoint>"):
+        run_training(data, tmp_path / "a", "losses.lambda_ic=0", f"kept_renderings={tmp_path}")
+    with pytest.raises(ConfigError, match=r"losses\.lambda_ic=0"):
+        module({}, kept_renderings=str(tmp_path))

@@ -86,7 +86,9 @@ def subject(arguments: argparse.Namespace) -> Subject:
 
 @lru_cache
 def _spiral(views: int) -> Prior:
-    return instantiate(load_config("distill", ["ckpt=none", "prior=srn_spiral", f"budget.views={views}"]).prior)
+    return instantiate(
+        load_config("distill", ["ckpt=none", "prior=srn_spiral", "prior.radius=1.3", f"budget.views={views}"]).prior
+    )
 
 
 def scene(subject: Subject, views: int, batch: int = 1, seed: int = 0) -> ViewBatch:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerfdiff.data.images import decode, decode_mask, decode_with_alpha, resize, resize_nearest
+from nerfdiff.data.images import decode, decode_mask, decode_with_alpha, resize, resize_nearest, stored_size
 from nerfdiff.errors import DataError
 
 
@@ -86,14 +86,109 @@ def test_damaged_files_are_named(tmp_path, rgb, damage):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"\0\0\0\x18ftypheic\0\0\0\0mif1heic", r"unsupported format \('heic'\), or none; convert it to PNG, JPEG"),
+        (b"v/1\x01\x02\0\0\0channels", "unsupported format .*convert it"),
+        (b"<html>\n<head>", "unsupported format .*begins with b'<html>.*or none"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a", "git lfs pull"),
+        (b"", r"not a whole image \(empty\)"),
+        (b"\x89PNG\r\n", r"not a whole image \(a damaged PNG\)"),
+    ],
+)
+def test_other_formats_are_not_called_damaged(tmp_path, content, message):
+    (tmp_path / "a.png").write_bytes(content)
+    for read in (decode, decode_mask, stored_size):
+        with pytest.raises(DataError, match=rf"a\.png: .*{message}") as error:
+            read(tmp_path / "a.png")
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("values", [np.ones((4, 5), np.float32), np.full((4, 5), 70000, np.int32)])
+def test_pixels_that_8_bits_would_cut_off_are_refused(tmp_path, values):
+    Image.fromarray(values).save(tmp_path / "a.tiff")
+    with pytest.raises(DataError, match=r"a\.tiff: .*8 or 16 bits"):
+        decode(tmp_path / "a.tiff")
+
+
+ORIENTATIONS = {  # what EXIF says of the stored pixels, as numpy would put them upright
+    2: lambda a: a[:, ::-1],
+    3: lambda a: a[::-1, ::-1],
+    4: lambda a: a[::-1],
+    5: lambda a: a.transpose(1, 0, 2),
+    6: lambda a: np.rot90(a, -1),
+    7: lambda a: np.rot90(a, -1)[::-1],
+    8: lambda a: np.rot90(a),
+}
+
+
+def save_oriented(path, pixels: np.ndarray, orientation: int) -> None:
+    image = Image.fromarray(pixels)
+    exif = image.getexif()
+    exif[0x0112] = orientation
+    image.save(path, exif=exif)
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_images_are_turned_where_only_the_upright_ones_fit_their_camera(tmp_path, rgb, orientation, caplog):
+    save_oriented(tmp_path / "a.png", rgb, orientation)
+    upright = ORIENTATIONS[orientation](rgb)
+    assert np.array_equal(decode(tmp_path / "a.png", (6, 9)), rgb)
+    assert np.array_equal(decode(tmp_path / "a.png", (60.0, 90.0)), rgb)
+    assert np.array_equal(decode_with_alpha(tmp_path / "a.png", upright=True)[0], upright)
+    if orientation > 4:
+        assert not caplog.messages
+        assert np.array_equal(decode(tmp_path / "a.png", (9, 6)), upright)
+        assert np.array_equal(decode(tmp_path / "a.png", (90.0, 60.0)), upright)
+    else:
+        assert caplog.text.count(f"Orientation of {orientation}") == 1
+    for size, stated in ((None, "no size"), ((7, 7), "w x h = 7x7")):
+        with pytest.raises(
+            DataError, match=rf"a\.png: its EXIF tag Orientation is {orientation} .*stored as 9x6.*{stated}"
+        ):
+            decode(tmp_path / "a.png", size)
+
+
+def test_an_exact_size_comes_before_a_similar_aspect(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (100, 101, 3), np.uint8)
+    save_oriented(tmp_path / "a.png", pixels, 6)
+    assert np.array_equal(decode(tmp_path / "a.png", (100, 101)), pixels)
+    assert np.array_equal(decode(tmp_path / "a.png", (101, 100)), np.rot90(pixels, -1))
+
+
+def test_square_images_are_used_as_stored_with_one_warning(tmp_path, rgb, caplog):
+    for name in "ab":
+        save_oriented(tmp_path / f"{name}.png", rgb[:6, :6], 6)
+        assert np.array_equal(decode(tmp_path / f"{name}.png", (6, 6)), rgb[:6, :6])
+    assert caplog.text.count("the stored ones are used") == 1
+
+
+@pytest.mark.parametrize("orientation", [0, 1, 9])
+def test_an_orientation_that_says_nothing_is_no_matter(tmp_path, rgb, orientation):
+    save_oriented(tmp_path / "a.png", rgb, orientation)
+    assert np.array_equal(decode(tmp_path / "a.png"), rgb)
+
+
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(DataError, match=r"000009\.png: no such image"):
         decode(tmp_path / "000009.png")
 
 
-def test_whole_factors_average_areas(rgb):
-    blocks = rgb[:6, :9].reshape(2, 3, 3, 3, 3).mean(axis=(1, 3))
-    assert np.abs(resize(rgb, (2, 3)) - blocks).max() <= 1  # Pillow rounds after each axis
+@pytest.mark.parametrize("factors", [(3, 3), (2, 2), (4, 2), (1, 2), (6, 10)])
+def test_whole_factors_average_areas_exactly(factors):
+    """Rounded once, ties to even: halves occur in a quarter of all blocks of four, and must not make images lighter."""
+    pixels = np.random.default_rng(0).integers(0, 256, (40 * factors[0], 40 * factors[1], 3), np.uint8)
+    sums = pixels.reshape(40, factors[0], 40, factors[1], 3).sum(axis=(1, 3), dtype=int)
+    means = sums / (factors[0] * factors[1])
+    assert np.array_equal(resize(pixels, (40, 40)), np.rint(means))
+    assert abs((resize(pixels, (40, 40)) - means).mean()) < 0.02
+
+
+@pytest.mark.parametrize("size", [(90, 90), (240, 240), (180, 180), (80, 160)])
+def test_no_size_makes_an_image_lighter_or_darker(size):
+    pixels = np.random.default_rng(0).integers(0, 256, (120, 120, 3), np.uint8)
+    assert abs(resize(pixels, size).mean() - pixels.mean()) < 0.08
 
 
 def test_resizing_keeps_the_borders_in_place_and_does_not_alias():

@@ -89,6 +89,29 @@ def test_points_are_where_the_pinhole_has_them(tmp_path, lens, per_frame):
     assert (scene.pixels[outside] == 255).all()
 
 
+@pytest.mark.parametrize("per_frame", [False, True])
+def test_lists_of_coefficients_are_the_same_lens(tmp_path, per_frame):
+    """nerfstudio's list, and OpenCV's with the same numbers in its own order."""
+    write_distorted(tmp_path, BARREL, per_frame)
+    file = tmp_path / "transforms.json"
+    content = json.loads(file.read_text())
+    k1, k2, p1, p2 = BARREL.values()
+    reads = [PosedImagesReader(tmp_path, "train", **SETTINGS).load(0, [1, 3]).pixels]
+    for lists in ({"distortion_params": [k1, k2, 0, 0, p1, p2]}, {"dist_coeffs": [k1, k2, p1, p2, 0]}, {}):
+        for place in (content, *content["frames"]):
+            for key in (*BARREL, "distortion_params"):
+                place.pop(key, None)
+        for place in content["frames"] if per_frame else [content]:
+            place |= lists
+        file.write_text(json.dumps(content))
+        reads.append(PosedImagesReader(tmp_path, "train", **SETTINGS).load(0, [1, 3]).pixels)
+        content = {key: value for key, value in content.items() if key != "dist_coeffs"}
+        for frame in content["frames"]:
+            frame.pop("dist_coeffs", None)
+    assert torch.equal(reads[0], reads[1]) and torch.equal(reads[0], reads[2])
+    assert (reads[0] != reads[3]).any()
+
+
 @pytest.mark.parametrize("lens", [BARREL, CUSHION], ids=["barrel", "cushion"])
 def test_ramps_are_read_where_the_lens_shows_them(lens):
     """Bilinear sampling of a ramp is exact: this is a test of the map to a twentieth of a pixel, borders included."""

@@ -325,6 +325,7 @@ def test_fingerprint_and_identity(tmp_path):
         read(root, "test"),
         read(root, near=1.0),
         read(root, white_background=False),
+        read(root, missing_images="skip"),
         read(root, image_size=32),
         read(root, convention="opencv", inward=False, near=1.0, far=2.0),
     ]
@@ -352,10 +353,104 @@ def test_the_configuration_reads_a_scene(tmp_path):
     assert len(pickle.dumps(reader)) < 20000
 
 
+def lose(folder, *numbers: int) -> None:
+    for number in numbers:
+        (folder / f"images/frame_{number:05d}.png").unlink()
+
+
+def test_frames_without_a_file_are_counted_and_can_be_left_out(tmp_path, caplog):
+    poses = write_nerfstudio(tmp_path / "fox", views=12)
+    lose(tmp_path / "fox", 1, 3, 4, 5, 9)
+    with pytest.raises(DataError) as error:
+        read(tmp_path)
+    assert "fox: 5 of 12 listed images or their masks are not there: images/frame_00001.png, " in str(error.value)
+    assert "and 2 more" in str(error.value) and "data.reader.missing_images=skip" in str(error.value)
+    for _ in range(2):
+        scene = read(tmp_path, missing_images="skip", image_size=[40, 56]).load(0, truth=True)
+    assert scene.views == tuple(f"frame_{k:05d}" for k in (2, 6, 7, 8, 10, 11, 12))
+    expected = np.stack([project(poses[int(view[-5:]) - 1])[:, :2] for view in scene.views])
+    pixels, _ = scene.cameras.project(torch.from_numpy(POINTS).float())
+    np.testing.assert_allclose(pixels, expected, atol=1e-3)
+    assert_colours_found(scene, 0)
+    assert caplog.text.count("5 of 12 listed images") == 1
+
+
+def test_frames_without_their_mask_are_left_out_as_well(tmp_path):
+    write_nerfstudio(tmp_path)
+    (tmp_path / "masks/frame_00002.png").rename(tmp_path / "masks/frame_00002.PNG")
+    (tmp_path / "masks/frame_00003.png").unlink()
+    assert len(read(tmp_path, missing_images="skip").load(0, truth=True).views) == 5
+
+
+def test_a_scene_without_any_image_is_an_error_all_the_same(tmp_path):
+    write_nerfstudio(tmp_path)
+    shutil.rmtree(tmp_path / "images")
+    with pytest.raises(DataError, match=r"6 of 6 listed images") as error:
+        read(tmp_path, missing_images="skip")
+    assert "missing_images" not in str(error.value)
+
+
+def test_files_of_a_camera_that_writes_large_letters_are_found(tmp_path):
+    write_nerfstudio(tmp_path, masks=False)
+    for file in (tmp_path / "images").iterdir():
+        file.rename(file.with_suffix(".PNG"))
+    edit(
+        tmp_path / "transforms.json",
+        lambda c: [f.update(file_path=f["file_path"].removesuffix(".png")) for f in c["frames"]],
+    )
+    assert_colours_found(read(tmp_path).load(0), 0)
+
+
+def turn(folder, orientation: int = 6) -> None:
+    """Store the images lying on their left side, and say so in their EXIF."""
+    for file in (folder / "images").iterdir():
+        with Image.open(file) as image:
+            lying = image.transpose(Image.Transpose.ROTATE_90)
+        exif = lying.getexif()
+        exif[0x0112] = orientation
+        lying.save(file, exif=exif)
+
+
+def test_images_stored_lying_are_read_upright_if_their_cameras_are(tmp_path):
+    """As phones store them, with a file for the upright pictures."""
+    write_nerfstudio(tmp_path, masks=False)
+    turn(tmp_path)
+    assert_colours_found(read(tmp_path).load(0), 0)
+    edit(tmp_path / "transforms.json", lambda c: c.update(fl_x=2 * FX, fl_y=2 * FY, cx=2 * CX, cy=2 * CY, w=112, h=80))
+    assert_colours_found(read(tmp_path).load(0), 0)
+
+
+def test_images_stored_lying_are_read_so_if_their_cameras_are(tmp_path):
+    """As COLMAP sees them, which does not look at EXIF."""
+    poses = write_nerfstudio(tmp_path, masks=False)
+    turn(tmp_path)
+
+    def lie_down(content):
+        content |= {"fl_x": FY, "fl_y": FX, "cx": CY, "cy": WIDTH - CX, "w": HEIGHT, "h": WIDTH}
+        for frame, pose in zip(content["frames"], poses, strict=True):
+            right, up, backward, centre = pose.T
+            frame["transform_matrix"] = np.stack([-up, right, backward, centre], 1).tolist()
+
+    edit(tmp_path / "transforms.json", lie_down)
+    scene = read(tmp_path).load(0)
+    assert scene.pixels.shape[-2:] == (WIDTH, HEIGHT)
+    assert_colours_found(scene, 0)
+
+
+def test_without_a_size_a_lying_image_is_refused(tmp_path):
+    write_nerfstudio(tmp_path, masks=False)
+    turn(tmp_path)
+    edit(tmp_path / "transforms.json", lambda c: [c.pop("w"), c.pop("h")])
+    with pytest.raises(
+        DataError, match=r"frame_00001\.png: its EXIF tag Orientation is 6.*states no size.*'w' and 'h'"
+    ):
+        read(tmp_path).load(0)
+
+
 CASES = {
     "truncated image": ("images/frame_00002.png", lambda f: f.write_bytes(f.read_bytes()[:-60]), "not a whole image"),
-    "missing image": ("images/frame_00002.png", lambda f: f.unlink(), "no such image"),
-    "missing mask": ("masks/frame_00002.png", lambda f: f.unlink(), "no such image"),
+    "missing image": ("images/frame_00002.png", lambda f: f.unlink(), "1 of 6 listed images or their masks are not"),
+    "missing mask": ("masks/frame_00002.png", lambda f: f.unlink(), "1 of 6 listed images or their masks are not"),
     "other size": (
         "images/frame_00002.png",
         lambda f: Image.fromarray(np.zeros((20, 28, 3), np.uint8)).save(f),
@@ -405,6 +500,7 @@ def test_wrong_roots(tmp_path):
         ({"near": 2.0, "far": 1.0}, "0 < near < far"),
         ({"near": 0.0}, "0 < near < far"),
         ({"far": float("nan")}, "0 < near < far"),
+        ({"missing_images": "ignore"}, "'ignore' is unknown; choose one of error, skip"),
         ({"convention": "colmap"}, "'colmap' is unknown; choose one of opengl, opencv"),
         ({"image_size": 0}, "image_size"),
     ],

@@ -227,6 +227,25 @@ def test_the_identity_tells_folder_split_and_size(tmp_path):
     assert read(tmp_path / "one", image_size=[32, 32]).identity == readers[3].identity
 
 
+@pytest.mark.parametrize("size", [f"{HEIGHT} {WIDTH}", f"{2 * HEIGHT} {2 * WIDTH}"])
+def test_photographs_stored_lying_are_turned_to_fit_the_intrinsics(tmp_path, size):
+    write_srn(tmp_path)
+    folder = tmp_path / "cars_train/scene1"
+    if size != f"{HEIGHT} {WIDTH}":
+        (folder / "intrinsics.txt").write_text(f"{2 * F} {2 * CX} {2 * CY} 0.\n0. 0. 0.\n1.\n{size}\n")
+    for file in (folder / "rgb").iterdir():
+        with Image.open(file) as image:
+            lying = image.transpose(Image.Transpose.ROTATE_90)
+        exif = lying.getexif()
+        exif[0x0112] = 6
+        lying.save(file, exif=exif)
+    assert_points_found(read(tmp_path).load(1))
+    (folder / "intrinsics.txt").unlink()
+    (folder / "intrinsics").mkdir()  # the flavour that states no size
+    with pytest.raises(DataError, match=r"scene1/rgb/000000\.png: its EXIF tag Orientation is 6"):
+        read(tmp_path).load(1)
+
+
 def test_missing_truth_of_one_view_is_an_error(tmp_path):
     write_srn(tmp_path, truth=True)
     (tmp_path / "cars_train/scene0/depth/000002.npz").unlink()

@@ -35,7 +35,7 @@ def other_size(file) -> None:
 
 CASES = {
     "truncated image": ("rgb/000002.png", truncate, r"rgb/000002\.png: not a whole image"),
-    "no image": ("rgb/000002.png", replace_with("<html>"), r"rgb/000002\.png: not a whole image"),
+    "no image": ("rgb/000002.png", replace_with("<html>"), r"rgb/000002\.png: an image of an unsupported format"),
     "image of another size": ("rgb/000002.png", other_size, r"rgb/000002\.png: 80x112 pixels.*image_size"),
     "image without pose": ("pose/000003.txt", lambda f: f.unlink(), r"images without a pose: 000003;"),
     "pose without image": ("rgb/000001.png", lambda f: f.unlink(), r"poses without an image: 000001$"),

@@ -156,8 +156,32 @@ def test_images_are_found_with_and_without_suffix(tmp_path, stored, suffix):
     (tmp_path / stored).touch()
     wanted = stored if suffix else stored.rpartition(".")[0]
     assert find_image(tmp_path / wanted) == tmp_path / stored
-    with pytest.raises(DataError, match=r"r_1: no such image, with or without.*\.png"):
-        find_image(tmp_path / "r_1")
+    assert find_image(tmp_path / "r_1") is find_image(tmp_path / "nowhere/r_0") is None
+
+
+@pytest.mark.parametrize(
+    ("listed", "stored"),
+    [
+        ("DJI_0001", "DJI_0001.JPG"),
+        ("DJI_0001", "DJI_0001.Jpeg"),
+        ("DJI_0001.jpg", "DJI_0001.JPG"),
+        ("dji_0001.JPG", "DJI_0001.jpg"),
+        ("0001", "0001.TIF"),
+        ("caf\u00e9.png", "cafe\u0301.png"),
+    ],
+)
+def test_capitals_and_accents_need_not_be_those_of_the_files(tmp_path, listed, stored):
+    assert find_image(tmp_path / listed) is None
+    (tmp_path / stored).touch()
+    (tmp_path / "other.png").touch()
+    assert find_image(tmp_path / listed) == tmp_path / stored
+    (tmp_path / listed).touch()
+    assert find_image(tmp_path / listed) == tmp_path / listed
+
+
+def test_another_suffix_than_the_listed_one_is_another_file(tmp_path):
+    (tmp_path / "r_0.jpg").touch()
+    assert find_image(tmp_path / "r_0.png") is None
 
 
 def pose(**changes) -> list[list[float]]:
@@ -254,6 +278,15 @@ def test_what_is_no_json_object(tmp_path, content):
     (tmp_path / "transforms.json").write_bytes(content)
     with pytest.raises(DataError, match=r"transforms\.json: expected"):
         read_transforms(tmp_path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-be"])
+def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path, encoding):
+    write_nerfstudio(tmp_path)
+    text = (tmp_path / "transforms.json").read_text()
+    mark = "\ufeff" if encoding == "utf-16-be" else ""
+    (tmp_path / "transforms.json").write_text(mark + text.replace("images/", "imäges/"), encoding=encoding)
+    assert read_transforms(tmp_path).frames[0].image == tmp_path / "imäges/frame_00001.png"
 
 
 def test_no_file_at_all(tmp_path):

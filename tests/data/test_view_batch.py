@@ -3,9 +3,12 @@
 import pytest
 import torch
 
+import posed_fixtures
 from data_fixtures import FAR, NEAR, write_srn
 from nerfdiff.data.batch import Sample, ViewBatch
+from nerfdiff.data.cache import CachedReader
 from nerfdiff.data.draws import Draws
+from nerfdiff.data.posed_images import PosedImagesReader
 from nerfdiff.data.srn import SRNReader
 from nerfdiff.data.views import EvaluationScenes, TrainingViews, spread
 from nerfdiff.errors import DataError
@@ -106,6 +109,54 @@ def test_evaluation_takes_the_source_by_its_number(tmp_path):
     assert item.target_depth.shape == item.target_mask.shape == (1, 4, 40, 56)
     with pytest.raises(DataError, match=r"scene0 has no view 7, but 5 views 000010 to 000099; set data\.source_view"):
         EvaluationScenes(SRNReader(tmp_path, "cars", "test", NEAR, FAR), source_view=7)
+
+
+@pytest.fixture
+def own_scenes(tmp_path) -> PosedImagesReader:
+    """Scenes of frames 0 to 3, 3 to 6 and 8 to 11, and one whose frames are not named by numbers."""
+    for name, start in (("a", 0), ("b", 3), ("c", 8), ("d", None)):
+        folder = tmp_path / "train" / name
+        posed_fixtures.write_nerfstudio(folder, views=4, masks=False)
+        if start is not None:
+            text = (folder / "transforms.json").read_text()
+            for k in range(4):
+                (folder / f"images/frame_{k + 1:05d}.png").rename(folder / f"images/{start + k:04d}.png")
+                text = text.replace(f"frame_{k + 1:05d}.png", f"{start + k:04d}.png")
+            (folder / "transforms.json").write_text(text)
+    return PosedImagesReader(tmp_path, "train", **posed_fixtures.SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("view", "taken", "others"),
+    [
+        (0, ("0000", "0003", "0008", "frame_00001"), 2),
+        (3, ("0003", "0003", "0008", "frame_00004"), 1),
+        (5, ("0003", "0005", "0008", "frame_00004"), 3),
+        (7, ("0003", "0006", "0008", "frame_00004"), 4),
+        (99, ("0003", "0006", "0011", "frame_00004"), 4),
+    ],
+)
+def test_own_scenes_that_lack_a_frame_take_the_nearest_with_one_warning(
+    own_scenes, tmp_path, view, taken, others, caplog
+):
+    for reader in (own_scenes, CachedReader(own_scenes, tmp_path / "cache", "own")):
+        caplog.clear()
+        dataset = EvaluationScenes(reader, source_view=view)
+        assert tuple(ViewBatch.collate([dataset[k]]).source_views[0] for k in range(4)) == taken
+        (said,) = [record.message for record in caplog.records if record.levelname == "WARNING"]
+        assert f"{others} of 4 scenes have no view {view}" in said and f"c ({taken[2]})" in said
+    training = TrainingViews(
+        own_scenes, Draws(seed=1, scenes=4, target_views=1, source_as_target=0.0), source_view=view
+    )
+    for draw in range(4):
+        sample = training[draw]
+        assert sample.scene.views[sample.source] == taken["abcd".index(sample.scene.id)]
+
+
+def test_a_frame_that_all_have_is_taken_without_a_word(own_scenes, caplog):
+    caplog.clear()
+    dataset = EvaluationScenes(own_scenes, source_view=8, scenes=1)
+    assert [own_scenes.scene_id(k) for k in dataset.indices] == ["c"] and not caplog.records
 
 
 def test_evaluation_takes_the_source_by_position_where_names_are_words(tmp_path):

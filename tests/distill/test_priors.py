@@ -59,15 +59,56 @@ def spiral_pose(k: int, radius: float) -> np.ndarray:
     return camera(radius * np.array(direction))
 
 
-@pytest.mark.parametrize(("near", "far", "radius"), [(0.8, 1.8, 1.3), (1.25, 2.75, 2.0)])
-def test_srn_spiral_is_every_fifth_test_camera_relative_to_the_input_view(near, far, radius):
+@pytest.mark.parametrize(
+    ("near", "far", "radius", "set_to"),
+    [(0.8, 1.8, 1.3, None), (1.25, 2.75, 2.0, None), (0.1, 9.0, 1.3, None), (0.1, 9.0, 2.0, 2.0)],
+)
+def test_srn_spiral_is_every_fifth_test_camera_relative_to_the_input_view(near, far, radius, set_to):
+    """Whatever near and far are: the radius is that of the scene's own cameras, or the one that is set."""
     source = spiral_pose(64, radius)
-    cameras = SRNSpiral(50, 64)(scene([source, spiral_pose(0, radius)], near, far))
+    others = [] if set_to else [spiral_pose(0, radius)]
+    cameras = SRNSpiral(50, 64, set_to)(scene([source, *others], near, far))
     assert cameras.shape == (1, 50)
     for k in (0, 7, 49):
         expected = np.linalg.inv(source) @ spiral_pose(5 * k, radius)
         np.testing.assert_allclose(cameras.c2w[0, k], expected, atol=2e-6)
     assert torch.equal(cameras.K[0, 3], K)
+
+
+@pytest.mark.parametrize("views", [1, 3, 100, 250, 251])
+def test_srn_spiral_has_no_view_twice(views):
+    source = spiral_pose(64, 1.3)
+    cameras = SRNSpiral(views, 64, None)(scene([source, spiral_pose(0, 1.3)])).c2w[0]
+    assert len(cameras) == len(torch.unique(cameras, dim=0)) == views
+    np.testing.assert_allclose(cameras[0], np.linalg.inv(source) @ spiral_pose(0, 1.3), atol=2e-6)
+    if views == 251:
+        np.testing.assert_allclose(cameras[200], np.linalg.inv(source) @ spiral_pose(200, 1.3), atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ((252, 64, None), r"prior\.views=252: expected 1 to 251"),
+        ((0, 64, None), r"prior\.views=0"),
+        ((50, 251, None), r"prior\.source_view=251: expected one of the spiral's, 0 to 250"),
+        ((50, -1, None), r"prior\.source_view=-1"),
+        ((50, 64, 0.0), r"prior\.radius=0\.0: expected a positive distance"),
+    ],
+)
+def test_srn_spiral_refuses_what_the_spiral_has_not(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        SRNSpiral(*settings)
+
+
+@pytest.mark.parametrize("others", [[], [0], [1]])
+def test_srn_spiral_needs_cameras_that_look_at_one_point_or_a_radius(others):
+    """The input camera alone, the same one again, and one beside it that looks in parallel."""
+    source = spiral_pose(64, 1.3)
+    beside = source.copy()
+    beside[:3, 3] += 0.2 * source[:3, 0]
+    batch = scene([source, *([source, beside][k] for k in others)])
+    with pytest.raises(DataError, match=r"scene a has no second camera.*set prior\.radius"):
+        SRNSpiral(50, 64, None)(batch)
 
 
 def test_own_views_are_the_inputs_and_the_others():
@@ -139,7 +180,7 @@ def test_part_of_the_sphere_stays_on_the_inputs_side():
 
 
 def test_all_are_priors():
-    for prior in (SRNSpiral(5, 64), OwnViews(5), Circle(5), Sphere(5, (0.0, 1.0), (0.0, 1.0), 0.0)):
+    for prior in (SRNSpiral(5, 64, None), OwnViews(5), Circle(5), Sphere(5, (0.0, 1.0), (0.0, 1.0), 0.0)):
         assert isinstance(prior, Prior)
 
 

@@ -25,7 +25,7 @@ SIZE = 8
 class Reader:
     """Scenes of grey images: view i of scene s has the level `levels[s][i]`."""
 
-    identity = "grey"
+    identity, nearest_view = "grey", False
 
     def __init__(self, levels, depth=None, mask=None):
         self.levels, self.depth, self.mask = levels, depth, mask

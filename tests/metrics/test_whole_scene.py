@@ -37,7 +37,7 @@ def moved(cameras: Cameras) -> Cameras:
 class Reader:
     """Balls, whose world is not that of the input camera (view 0)."""
 
-    identity = "balls"
+    identity, nearest_view = "balls", False
 
     def __init__(self, ids, depth=True, mask=True):
         self.ids, self.known = ids, (depth, mask)

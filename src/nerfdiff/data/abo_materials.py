@@ -72,6 +72,8 @@ class ABOMaterials:
         DataError: `root` is missing or has no objects in it, or they are not those of its table.
     """
 
+    nearest_view = False
+
     def __init__(
         self,
         root: str | Path,

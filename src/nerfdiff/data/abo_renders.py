@@ -54,6 +54,8 @@ class ABORenders:
         DataError: `root` is missing or has no objects in it, or a stored split does not fit them.
     """
 
+    nearest_view = False
+
     def __init__(
         self,
         root: str | Path,

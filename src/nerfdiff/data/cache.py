@@ -30,7 +30,7 @@ from nerfdiff.cameras import Cameras
 from nerfdiff.data.scene import Scene, SceneReader
 from nerfdiff.errors import DataError
 
-FORMAT = "2"  # to be raised when the files above change their meaning
+FORMAT = "3"  # to be raised when the files above change their meaning, or readers decode other pixels
 MAX_THREADS = 16  # decoding releases the interpreter lock, but not all the time
 log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ class CachedReader:
 
     def __init__(self, reader: SceneReader, folder: str | Path, name: str):
         self.reader = reader
-        self.identity = reader.identity
+        self.identity, self.nearest_view = reader.identity, reader.nearest_view
         self._fingerprint = reader.fingerprint()
         prefix = f"{name}-{_short(FORMAT + reader.identity)}"
         self.path = Path(folder) / f"{prefix}-{_short(self._fingerprint)}"

@@ -56,6 +56,8 @@ class Clevr3DReader:
             the wanted number of objects.
     """
 
+    nearest_view = False
+
     def __init__(
         self,
         root: str | Path,

@@ -53,9 +53,10 @@ class Lens:
         Raises:
             DataError: the camera is a fisheye or another that is not perspective, or has coefficients of a denominator.
         """
-        model = values.get("camera_model")
-        if (model is not None and model not in PERSPECTIVE) or values.get("is_fisheye"):
-            shown = "a fisheye" if model is None or model in PERSPECTIVE else repr(model)[:80]
+        models = [values.get(key) for key in ("camera_model", "camera_type")]
+        others = [repr(m)[:80] for m in models if m is not None and str(m).upper() not in PERSPECTIVE]
+        if others or values.get("is_fisheye"):
+            shown = others[0] if others else "a fisheye"
             raise DataError(f"{where}: the camera is {shown}, only perspective ones are read; {UNDISTORT}")
         k1, k2, k3, k4, k5, k6, p1, p2 = (
             optional_number(values, key, where) or 0.0 for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")

@@ -95,10 +95,9 @@ class Picture:
 
     def _cut_out(self, path: Path) -> tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
         """The picture with white around the object, and where the object is."""
-        pixels, opaque = decode_with_alpha(path)
-        pixels = _upright(pixels, path)
+        pixels, opaque = decode_with_alpha(path, upright=True)
         told = opaque is not None and not opaque.all()  # many programs write an alpha that says nothing
-        where = _upright(opaque, path) if told else (pixels < 255 * self.white).any(-1)
+        where = opaque if told else (pixels < 255 * self.white).any(-1)
         if self.mask is not None:
             mask = _upright(decode_mask(Path(self.mask)), Path(self.mask))
             if mask.shape != pixels.shape[:2]:
@@ -161,7 +160,7 @@ def area_resample(
     columns = _overlaps(window[1], window[3] / size[1], size[1], pixels.shape[1])
     # averaging what is missing to white leaves white wherever there is no pixel
     ink = np.stack([rows @ (255 - pixels[..., c]).astype(np.float32) @ columns.T for c in range(3)], -1)
-    return (255 - ink.clip(0, 255) + 0.5).astype(np.uint8)
+    return np.rint(255 - ink.clip(0, 255)).astype(np.uint8)
 
 
 def _overlaps(start: float, step: float, new: int, old: int) -> Float[np.ndarray, "new old"]:

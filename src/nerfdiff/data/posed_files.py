@@ -1,5 +1,6 @@
 """Poses and intrinsics in text files, checked as they are read."""
 
+import codecs
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ RIGID_TOLERANCE = 1e-3
 """Largest deviation of R·Rᵀ from the identity that rounding in a text file explains."""
 MAX_POSITION = 1e12
 """Coordinates whose powers single precision still holds."""
+UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+"""Of a file that Windows PowerShell wrote, say."""
 
 
 def read_numbers(path: Path, counts: tuple[int, ...], what: str) -> Float[np.ndarray, " count"]:
@@ -33,13 +36,14 @@ def read_numbers(path: Path, counts: tuple[int, ...], what: str) -> Float[np.nda
 
 
 def read_text(path: Path, expected: str) -> str:
-    """The file's text.
+    """The file's text: UTF-8, or UTF-16 where a byte-order mark says so; without the mark.
 
     Raises:
         DataError: the file cannot be read; the message says what was `expected` in it.
     """
     try:
-        return path.read_text()
+        content = path.read_bytes()
+        return content.decode("utf-16" if content.startswith(UTF16_MARKS) else "utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: {expected}, but it cannot be read ({error})") from error
 

@@ -28,11 +28,12 @@ from nerfdiff.data.index import folder_stamp
 from nerfdiff.data.posed_files import MAX_POSITION
 from nerfdiff.data.posed_folders import find_scenes
 from nerfdiff.data.scene import Scene
-from nerfdiff.data.transforms_json import Frame, Transforms, find_image, read_transforms
+from nerfdiff.data.transforms_json import Frame, Transforms, read_transforms
 from nerfdiff.data.view_stack import stack_pixels
 from nerfdiff.errors import ConfigError, DataError
 
 CONVENTIONS = ("opengl", "opencv")
+MISSING_IMAGES = ("error", "skip")
 KEPT_SCENES = 256
 """Scenes whose JSON is remembered, so that the memory of a process does not grow with the dataset."""
 log = logging.getLogger(__name__)
@@ -65,12 +66,15 @@ class PosedImagesReader:
         image_size: (height, width), or one side of a square, to resize to, each image with intrinsics of its own;
             None keeps the stored size.
         crop: (height, width), or one side of a square, to cut out of the middle before; None keeps all.
+        missing_images: "error" or "skip" frames whose image or mask is not there.
 
     Raises:
         ConfigError: settings that make no sense.
         MissingSplit: `root` has no such split, or too few scenes for it.
         DataError: `root` is missing or empty, or its first scene is damaged.
     """
+
+    nearest_view = True  # frames are numbered as they were taken, and some are lost on the way
 
     def __init__(
         self,
@@ -85,19 +89,24 @@ class PosedImagesReader:
         split_seed: int,
         image_size: int | Sequence[int] | None = None,
         crop: int | Sequence[int] | None = None,
+        missing_images: str = "error",
     ):
         if not all(bound is None or bound > 0 for bound in (near, far)) or (near and far and near >= far):
             raise ConfigError(f"near = {near} and far = {far} must satisfy 0 < near < far, or be null")
         if convention not in CONVENTIONS:
             raise ConfigError(f"convention {convention!r} is unknown; choose one of {', '.join(CONVENTIONS)}")
-        self.near, self.far = near, far
+        if missing_images not in MISSING_IMAGES:
+            raise ConfigError(
+                f"missing_images {missing_images!r} is unknown; choose one of {', '.join(MISSING_IMAGES)}"
+            )
+        self.near, self.far, self.missing_images = near, far, missing_images
         self.convention, self.inward, self.white_background = convention, inward, white_background
         self.framing = Framing.of(crop, image_size)
         root = Path(root)
         self.folders = find_scenes(root, split, split_sizes, split_seed)
         self.identity = (
             f"posed_images {root.resolve()} {split} {dict(split_sizes)} {split_seed} {self.framing} {convention} "
-            f"bounds {near} {far} white {white_background}"
+            f"bounds {near} {far} white {white_background} missing {missing_images}"
         )
         self._parsed: dict[int, _PosedScene] = {}
         first = self._scene(0)
@@ -132,9 +141,8 @@ class PosedImagesReader:
         scene = self._scene(index)
         every = scene.transforms.frames
         frames = every if views is None else [every[view] for view in views]
-        files = [find_image(frame.image) for frame in frames]
-        opened = [self._open(frame, file, truth) for frame, file in zip(frames, files, strict=True)]
-        pixels = stack_pixels([self.framing.image(image) for image, _, _ in opened], files)
+        opened = [self._open(frame, truth) for frame in frames]
+        pixels = stack_pixels([self.framing.image(image) for image, _, _ in opened], [frame.image for frame in frames])
         K = [self.framing.K(k, *image.shape[:2]) for image, _, k in opened]
         c2w = np.stack([frame.c2w for frame in frames])
         return Scene(
@@ -148,10 +156,11 @@ class PosedImagesReader:
         )
 
     def _open(
-        self, frame: Frame, file: Path, truth: bool
+        self, frame: Frame, truth: bool
     ) -> tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"] | None, Float[np.ndarray, "3 3"]]:
         """A frame's image, its foreground by mask or else, where `truth` asks for it, by transparency, and its K."""
-        image, opaque = images.decode_with_alpha(file) if truth else (images.decode(file), None)
+        image, opaque = images.decode_with_alpha(frame.image, frame.pinhole.size)
+        opaque = opaque if truth else None
         K, mask = frame.pinhole.K(*image.shape[:2]), _mask(frame, image.shape[:2])
         foreground = opaque if mask is None else mask
         if frame.lens is not None:
@@ -171,7 +180,7 @@ class PosedImagesReader:
         return parsed
 
     def _parse(self, folder: Path) -> _PosedScene:
-        transforms = read_transforms(folder, self.convention)
+        transforms = read_transforms(folder, self.convention).found(folder, skip=self.missing_images == "skip")
         gaze = Gaze.of(transforms.c2w)
         if self.inward:
             gaze.refuse_outward(folder, self.convention)
@@ -204,7 +213,7 @@ def _half_angle(frames: Sequence[Frame]) -> float:
     widest = 0.0
     cameras = {(f.pinhole.focal, f.pinhole.angle, f.pinhole.centre, f.pinhole.size): f for f in reversed(frames)}
     for frame in cameras.values():
-        height, width = map(round, frame.pinhole.size or images.stored_size(find_image(frame.image)))
+        height, width = map(round, frame.pinhole.size or images.stored_size(frame.image))
         K = frame.pinhole.K(height, width)
         widest = max(widest, math.atan(max(width / K[0, 0], height / K[1, 1]) / 2))
     return widest

@@ -51,6 +51,8 @@ class SceneReader(Protocol):
 
     identity: str
     """What is read and how (folder and settings): two readers of one identity read the same files alike."""
+    nearest_view: bool
+    """Whether the number of a view that a scene lacks means the nearest one that it has."""
 
     def __len__(self) -> int:
         """Number of scenes."""

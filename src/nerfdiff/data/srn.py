@@ -58,6 +58,8 @@ class SRNReader:
         DataError: `root` is missing or empty, or the split has no scenes.
     """
 
+    nearest_view = False
+
     def __init__(
         self,
         root: str | Path,
@@ -103,8 +105,9 @@ class SRNReader:
         folder = self._list(index)
         positions = range(len(folder.views)) if views is None else views
         names = tuple(folder.views[p] for p in positions)
-        stored = [images.decode(folder.rgb[p]) for p in positions]
         shared = _shared_intrinsics(folder.path)
+        stated = None if shared is None else (shared.height, shared.width)
+        stored = [images.decode(folder.rgb[p], stated) for p in positions]
         sizes = [image.shape[:2] for image in stored]
         K = self._intrinsics(folder, names, sizes, shared)
         pixels = stack_pixels([self.framing.image(image) for image in stored], [folder.rgb[p] for p in positions])

@@ -3,21 +3,26 @@
     {"fl_x", "fl_y", "cx", "cy", "w", "h", "frames": [{"file_path": "images/1.jpg", "transform_matrix", "mask_path"}]}
     {"camera_angle_x", "frames": [{"file_path": "./train/r_0", "transform_matrix"}]}
 
-Intrinsics, and distortion (`lens.Lens`), may stand in a frame as well as beside the frames. `transform_matrix` is
-camera-to-world with OpenGL axes (x right, y up, looking along −z). Where both kinds of file are there,
-`transforms.json` is read.
+Intrinsics, and distortion (`lens.Lens`), may stand in a frame as well as beside the frames, and in other spellings
+(`camera_keys`). `transform_matrix` is camera-to-world with OpenGL axes (x right, y up, looking along −z). Where both
+kinds of file are there, `transforms.json` is read.
 """
 
+import logging
+import os
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from nerfdiff.data.camera_keys import camera_keys, frame_camera
 from nerfdiff.data.json_files import entry, matrix, optional_number, read_json
 from nerfdiff.data.lens import Lens
 from nerfdiff.data.posed_files import check_rigid
@@ -26,9 +31,10 @@ from nerfdiff.errors import DataError
 
 ONE_FILE = "transforms.json"
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 SINGLE_PRECISION = 1e-4
 """Smallest extent of the cameras, relative to their distance from the world's origin, that survives fp32."""
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -37,7 +43,7 @@ class Frame:
 
     Args:
         name: file stem; where stems occur twice, the path within the scene with "_" for "/".
-        image, mask: files; the image's suffix may be missing, see `find_image`.
+        image, mask: files, as they are listed until `Transforms.found`.
         c2w: camera-to-world with OpenCV axes.
         pinhole: its intrinsics.
         lens: its distortion; None where there is none.
@@ -66,6 +72,37 @@ class Transforms:
     @property
     def c2w(self) -> Float[np.ndarray, "views 4 4"]:
         return np.stack([frame.c2w for frame in self.frames])
+
+    def found(self, folder: Path, skip: bool) -> "Transforms":
+        """With the files that are there for those that are listed, see `find_image`.
+
+        Args:
+            folder: the scene's, for messages.
+            skip: leave out frames whose image or mask is missing, with one warning.
+
+        Raises:
+            DataError: some are missing and not to be left out, or all are.
+        """
+        frames, missing = [], []
+        for frame in self.frames:
+            image, mask = find_image(frame.image), None if frame.mask is None else find_image(frame.mask)
+            lost = [listed for listed, file in ((frame.image, image), (frame.mask, mask)) if listed and not file]
+            missing += lost[:1]
+            if not lost:
+                frames.append(replace(frame, image=image, mask=mask))
+        if not missing:
+            return replace(self, frames=tuple(frames))
+        named = ", ".join(str(file).removeprefix(f"{folder}/") for file in missing[:3])
+        text = f"{folder}: {len(missing)} of {len(self.frames)} listed images or their masks are not there: {named}"
+        text += f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+        if not frames or not skip:
+            instead = ", or set data.reader.missing_images=skip to go on without these frames" if frames else ""
+            raise DataError(
+                f"{text}; looked for as they are listed, in other capitals, and without suffix also as "
+                f"{', '.join(IMAGE_SUFFIXES)}. Put them there{instead}"
+            )
+        _warn_once(f"{text}; going on without these frames")
+        return replace(self, frames=tuple(frames))
 
 
 def is_scene(folder: Path) -> bool:
@@ -99,25 +136,41 @@ def read_transforms(folder: Path, convention: str = "opengl") -> Transforms:
     return Transforms(tuple(frames), near, far)
 
 
-def find_image(path: Path) -> Path:
-    """The file itself, or, for a path without suffix, the image beside it that has one.
+def find_image(path: Path) -> Path | None:
+    """The file itself, or, for a path without suffix, the image beside it that has one; else None.
 
-    Raises:
-        DataError: there is none.
+    Capitals, and how accents are composed, need not be those of the file's name: other systems do not tell them apart.
     """
-    if path.suffix.lower() in IMAGE_SUFFIXES:
-        return path
-    for candidate in (path, *(path.with_name(path.name + suffix) for suffix in IMAGE_SUFFIXES)):
-        if candidate.is_file():
-            return candidate
-    raise DataError(f"{path}: no such image, with or without one of the suffixes {', '.join(IMAGE_SUFFIXES)}")
+    suffixes = ("",) if path.suffix.lower() in IMAGE_SUFFIXES else ("", *IMAGE_SUFFIXES)
+    names = [path.name + suffix for suffix in suffixes]
+    found = next((file for file in map(path.with_name, names) if file.is_file()), None)
+    if found is not None or not path.parent.is_dir():
+        return found
+    others = _folded_names(path.parent, path.parent.stat().st_mtime_ns)
+    alike = [path.with_name(others[_folded(name)]) for name in names if _folded(name) in others]
+    return next((file for file in alike if file.is_file()), None)
+
+
+@lru_cache(maxsize=4)
+def _folded_names(folder: Path, changed: int) -> dict[str, str]:
+    """Names in a folder, last changed then, by what they have in common with others like them."""
+    return {_folded(name): name for name in sorted(os.listdir(folder), reverse=True)}
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+@lru_cache
+def _warn_once(text: str) -> None:
+    log.warning(text)
 
 
 def _frames(file: Path, content: Mapping[str, Any], convention: str) -> list[Frame]:
     listed = entry(content, "frames", list, file)
     if not listed:
         raise DataError(f"{file}: 'frames' is empty; expected one entry per image")
-    frames = []
+    shared, frames = camera_keys(content, str(file)), []
     for position, frame in enumerate(listed):
         where = f"{file}: frames[{position}]"
         path = _relative(entry(frame, "file_path", str, where), "file_path", where)
@@ -125,10 +178,9 @@ def _frames(file: Path, content: Mapping[str, Any], convention: str) -> list[Fra
         c2w = _pose(entry(frame, "transform_matrix", list, where), where)
         if convention == "opengl":
             c2w = c2w * [1, -1, -1, 1]
-        mask = None
-        if frame.get("mask_path") is not None:
-            mask = file.parent / _relative(entry(frame, "mask_path", str, where), "mask_path", where)
-        camera = {**content, **frame}
+        camera, mask = frame_camera(shared, camera_keys(frame, where)), None
+        if "mask_path" in camera:
+            mask = file.parent / _relative(entry(camera, "mask_path", str, where), "mask_path", where)
         lens, pinhole = Lens.read(camera, where), Pinhole.read(camera, where)
         frames.append(Frame(str(path), file.parent / path, mask, c2w, pinhole, lens))
     return frames

@@ -1,11 +1,16 @@
 """Datasets over a reader: numbered training draws, and scenes to evaluate."""
 
+import logging
+from collections.abc import Sequence
+
 from torch.utils.data import Dataset
 
 from nerfdiff.data.batch import Sample
 from nerfdiff.data.draws import Draws
 from nerfdiff.data.scene import SceneReader
-from nerfdiff.errors import DataError
+from nerfdiff.errors import DataError, some
+
+log = logging.getLogger(__name__)
 
 
 class TrainingViews(Dataset[Sample]):
@@ -44,8 +49,8 @@ class EvaluationScenes(Dataset[Sample]):
 
     Args:
         reader: the split to evaluate.
-        source_view: number of the source view: its name where the views have numbers for names, else its
-            position.
+        source_view: number of the source view, see `view_numbers`; where some scenes lack it and have their nearest
+            one instead, a warning says so.
         scenes: how many scenes, spread evenly over the split (all where None or more than there are).
         targets: how many targets per scene, spread evenly over the other views (all where None).
         stride: of the other views, take every `stride`-th.
@@ -67,6 +72,19 @@ class EvaluationScenes(Dataset[Sample]):
         # looked up now, so that a long run does not fail at its first validation
         self.sources = [position_of(reader, index, source_view) for index in self.indices]
         self.targets, self.stride = targets, stride
+        nearest = []
+        for index, source in zip(self.indices, self.sources, strict=True):
+            names = reader.view_names(index)
+            if view_numbers(names)[source] != source_view:
+                nearest.append(f"{reader.scene_id(index)} ({names[source]})")
+        if nearest:
+            log.warning(
+                "%d of %d scenes have no view %d (data.source_view) and the nearest one as their input: %s",
+                len(nearest),
+                len(self.indices),
+                source_view,
+                some(nearest),
+            )
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -83,20 +101,26 @@ class EvaluationScenes(Dataset[Sample]):
 
 
 def position_of(reader: SceneReader, index: int, view: int) -> int:
-    """Position among a scene's views of view number `view`: its name where names are numbers, else its position.
+    """Position among a scene's views of view number `view`, or of the nearest where `reader.nearest_view`.
 
     Raises:
         DataError: there is no such view.
     """
     names = reader.view_names(index)
-    numbered = all(name.isdecimal() for name in names)
-    numbers = [int(name) for name in names] if numbered else list(range(len(names)))
+    numbers = view_numbers(names)
+    if reader.nearest_view:
+        return min(range(len(numbers)), key=lambda position: (abs(numbers[position] - view), numbers[position]))
     if view not in numbers:
         raise DataError(
             f"scene {reader.scene_id(index)} has no view {view}, but {len(names)} views {names[0]} to {names[-1]}; set "
             "data.source_view (or data.val_source_view, data.train_source_view) to one of them"
         )
     return numbers.index(view)
+
+
+def view_numbers(names: Sequence[str]) -> list[int]:
+    """Each view's number: its name where all names are numbers, else its position."""
+    return [int(name) for name in names] if all(name.isdecimal() for name in names) else list(range(len(names)))
 
 
 def spread(count: int, wanted: int | None) -> list[int]:

@@ -81,6 +81,28 @@ def test_without_the_way_through_the_rendering_the_field_has_no_gradient_of_the_
     assert not torch.allclose(through[name], alone[name])
 
 
+def test_the_weighting_by_output_is_edms(batch):
+    """With x0 = αZ - σv, an error of v is one of x0 over σ; EDM's weight on x0's is SNR + 1/σ_data²."""
+    std, t = 0.2, torch.tensor([0.1, 0.5, 0.9, 0.99], dtype=torch.float64)
+    made = NerfDiffModule(
+        config(conditioning={"residual_std": std}), {"lambda_ic": 1, "lambda_dm": 1}, OPTIMIZER, [0.5], False, 0
+    )
+    alpha, sigma = torch.cos(torch.pi * t / 2), torch.sin(torch.pi * t / 2)
+    per_x0_error = 1 / (sigma * made.model.denoiser.output_scale(t)) ** 2
+    torch.testing.assert_close(per_x0_error, alpha**2 / sigma**2 + 1 / std**2)
+
+
+def test_every_target_has_a_time_of_its_own(batch, monkeypatch):
+    seen = []
+    made = module({})
+    velocity = made.model.denoiser.velocity
+    monkeypatch.setattr(
+        made.model.denoiser, "velocity", lambda z, t, c: (seen.extend(t.tolist()), velocity(z, t, c))[1]
+    )
+    made.training_step(batch, 0)
+    assert len(set(seen)) == 4  # two draws of two targets
+
+
 def test_kept_renderings_are_what_would_be_rendered(batch, tmp_path):
     plain, keeping = module({"lambda_ic": 0}), module({"lambda_ic": 0}, kept_renderings=str(tmp_path))
     encoding = plain.model.encode(batch.source, batch.source_cameras, batch.near, batch.far)
@@ -125,7 +147,13 @@ def test_losses_that_cannot_be(losses, message):
 def test_two_phases_as_a_person_runs_them(data, tmp_path):
     field = tmp_path / "field"
     run_training(data, field, *FIELD)
-    more = ["losses.lambda_ic=0", f"init={field}", f"kept_renderings={tmp_path / 'kept'}", "data.train_source_views=1", "optimizer.decay=none"]
+    more = [
+        "losses.lambda_ic=0",
+        f"init={field}",
+        f"kept_renderings={tmp_path / 'kept'}",
+        "data.train_source_views=1",
+        "optimizer.decay=none",
+    ]
     run_training(data, tmp_path / "cdm", *more)
     before, after = (load_model(run, "raw", "assets").model.state_dict() for run in (field, tmp_path / "cdm"))
     averaged = load_model(field, "ema", "assets").model.state_dict()

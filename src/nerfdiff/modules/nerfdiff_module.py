@@ -14,6 +14,7 @@ from torch import Tensor
 
 from nerfdiff.cameras import Rays
 from nerfdiff.data.batch import ViewBatch
+from nerfdiff.diffusion.denoiser import Condition
 from nerfdiff.diffusion.schedule import add_noise, alpha_sigma, expand, v_from_x0_eps
 from nerfdiff.errors import ConfigError
 from nerfdiff.field.encoder import Encoding
@@ -23,7 +24,7 @@ from nerfdiff.model import NerfDiff
 from nerfdiff.modules.kept_renderings import KeptRenderings
 from nerfdiff.randomness import generator, spread_times
 
-WHOLE = {"ray_share": 1.0, "through_rendering": True}
+WHOLE = {"ray_share": 1.0, "through_rendering": True, "weighting": "v"}
 """The paper's joint loss, which checkpoints from before there was another have."""
 
 
@@ -35,7 +36,9 @@ class NerfDiffModule(LightningModule):
         losses: `lambda_ic` and `lambda_dm`, 0 for a part that is not trained: without L^DM the field alone is, without
             L^IC the CDM alone, on the renderings of a field that stays as it is. `ray_share`: L^IC is measured on so
             many of a target's rays, drawn anew at every step. `through_rendering`: the gradient of L^DM flows back
-            through the rendering into the field (paper).
+            through the rendering into the field (paper). `weighting` of L^DM over t: `v`, as its error has it, or
+            `output`, the error of what the U-Net itself puts out (EDM, Karras et al. 2022, arXiv 2206.00364, eq. 8),
+            which differs with a `residual_std` and asks more of noisy images.
         optimizer: AdamW's `lr`, `weight_decay`, `betas`; `warmup_steps` of linear warm-up; `decay` is `none` or
             `cosine`, to zero at the end of training.
         validation_times: times t at which the denoising loss is measured on held-out views.
@@ -211,15 +214,26 @@ class NerfDiffModule(LightningModule):
         """L^DM (paper, eq. "ddpm") on v."""
         condition = self.model.condition(encoding, batch.target_cameras, rendered)
         targets = 2 * batch.targets.flatten(0, 1) - 1
-        times = spread_times(batch.draws, self.hparams.seed).repeat_interleave(batch.target_cameras.shape[1])
-        return self._denoising_loss(condition, targets, eps.flatten(0, 1), times)
+        views = batch.target_cameras.shape[1]
+        each = (batch.draws[:, None] * views + torch.arange(views, device=batch.draws.device)).flatten()
+        times = spread_times(each, self.hparams.seed)
+        weighting = (WHOLE | self.hparams.losses)["weighting"]
+        return self._denoising_loss(condition, targets, eps.flatten(0, 1), times, weighting)
 
     def _denoising_loss(
-        self, condition, x0: Float[Tensor, "batch 3 height width"], eps: Tensor, t: Float[Tensor, "batch"]
+        self,
+        condition: Condition,
+        x0: Float[Tensor, "batch 3 height width"],
+        eps: Float[Tensor, "batch 3 height width"],
+        t: Float[Tensor, "batch"],
+        weighting: str = "v",
     ) -> Tensor:
         alpha, sigma = (expand(c, x0) for c in alpha_sigma(t))
         predicted = self.model.denoiser.velocity(add_noise(x0, eps, alpha, sigma), t, condition)
-        return F.mse_loss(predicted, v_from_x0_eps(x0, eps, alpha, sigma))
+        error = predicted - v_from_x0_eps(x0, eps, alpha, sigma)
+        if weighting == "output":
+            error = error / expand(self.model.denoiser.output_scale(t), x0)
+        return error.square().mean()
 
     def _noise(self, batch: ViewBatch, losses: Mapping) -> dict[str, Tensor]:
         """ε, the chosen rays and the ray jitter of every training item, each a function of its draw alone."""
@@ -232,7 +246,9 @@ class NerfDiffModule(LightningModule):
         if not self.frozen_field:
             noise["jitter"] = torch.stack([torch.rand(some, samples, generator=g, device=g.device) for g in generators])
         if losses["lambda_dm"]:
-            noise["eps"] = torch.stack([torch.randn(targets.shape[1:], generator=g, device=g.device) for g in generators])
+            noise["eps"] = torch.stack(
+                [torch.randn(targets.shape[1:], generator=g, device=g.device) for g in generators]
+            )
         if some < rays:
             noise["rays"] = torch.stack([torch.randperm(rays, generator=g, device=g.device)[:some] for g in generators])
         return noise
@@ -242,6 +258,8 @@ def _check_losses(losses: Mapping, kept_renderings: str | None) -> None:
     ic, dm, share = losses["lambda_ic"], losses["lambda_dm"], losses["ray_share"]
     if ic < 0 or dm < 0 or ic == dm == 0:
         raise ConfigError(f"losses.lambda_ic={ic}, lambda_dm={dm}: neither may be negative, nor both be 0")
+    if losses["weighting"] not in ("v", "output"):
+        raise ConfigError(f"losses.weighting={losses['weighting']}: choose v or output")
     if not 0 < share <= 1:
         raise ConfigError(f"losses.ray_share={share}: expected a share above 0, at most 1")
     if losses["through_rendering"] and ic and dm and share < 1:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerfdiff.data.images import decode, decode_mask, decode_with_alpha, resize, resize_nearest
+from nerfdiff.data.images import decode, decode_with_alpha, resize, resize_nearest
 from nerfdiff.errors import DataError
 
 
@@ -60,20 +60,6 @@ def test_sixteen_bits(tmp_path, rgb, channels):
     values = np.concatenate([rgb, np.full((6, 9, 1), 255)], -1)[..., :channels].astype(np.uint16) * 257
     write_png16(tmp_path / "a.png", values)
     assert np.array_equal(decode(tmp_path / "a.png"), rgb if channels > 1 else np.repeat(rgb[..., :1], 3, -1))
-
-
-def test_mask(tmp_path):
-    Image.fromarray(np.array([[0, 255, 127, 128]], np.uint8)).save(tmp_path / "m.png")
-    assert decode_mask(tmp_path / "m.png").tolist() == [[False, True, False, True]]
-
-
-@pytest.mark.parametrize("levels", [[0, 1], [0, 255]])
-def test_masks_of_zero_and_one_are_those_of_black_and_white(tmp_path, levels):
-    where = np.array([[True, False, False], [True, True, False]])
-    Image.fromarray(np.array(levels, np.uint8)[where.astype(int)]).save(tmp_path / "m.png")
-    assert np.array_equal(decode_mask(tmp_path / "m.png"), where)
-    Image.fromarray(np.zeros((2, 3), np.uint8)).save(tmp_path / "m.png")
-    assert not decode_mask(tmp_path / "m.png").any()
 
 
 @pytest.mark.parametrize("damage", [lambda b: b[: len(b) // 2], lambda b: b"", lambda b: b"no image at all" * 9])

@@ -32,6 +32,7 @@ from nerfdiff.data.exr import read_exr
 from nerfdiff.data.framing import Framing
 from nerfdiff.data.index import cached_index, folder_stamp, index_name
 from nerfdiff.data.item_folders import item_folders
+from nerfdiff.data.masks import read_mask
 from nerfdiff.data.optical_axes import ObjectCameras, check_settings, object_cameras, report
 from nerfdiff.data.pinhole import check_K
 from nerfdiff.data.scene import MissingSplit, Scene
@@ -156,7 +157,7 @@ class ABOMaterials:
         renders = numbered_files(folder / "render" / environment, IMAGE_SUFFIXES, stored.numbers)
         segments = numbered_files(folder / "segmentation", IMAGE_SUFFIXES, stored.numbers)
         positions = list(range(len(stored.numbers)) if views is None else views)
-        masks = [images.decode_mask(segments[p]) for p in positions]
+        masks = [read_mask(segments[p]) for p in positions]
         on_white = [_on_white(renders[p], mask, segments[p]) for p, mask in zip(positions, masks, strict=True)]
         K = [_checked_K(folder, stored, p, mask.shape) for p, mask in zip(positions, masks, strict=True)]
         depth = None

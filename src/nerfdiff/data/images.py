@@ -28,7 +28,7 @@ def decode_with_alpha(
     Raises:
         DataError: as `decode`.
     """
-    image = _open(path)
+    image = open_image(path)
     if image.mode.startswith("I"):  # 16-bit grey, which Pillow would clip rather than scale
         grey = (np.asarray(image) >> 8).astype(np.uint8)
         return np.repeat(grey[..., None], 3, axis=-1), None
@@ -37,16 +37,6 @@ def decode_with_alpha(
     rgba = np.asarray(image.convert("RGBA"))
     colour, alpha = rgba[..., :3].astype(np.uint16), rgba[..., 3:].astype(np.uint16)
     return ((colour * alpha + 255 * (255 - alpha) + 127) // 255).astype(np.uint8), rgba[..., 3] > 127
-
-
-def decode_mask(path: Path) -> Bool[np.ndarray, "height width"]:
-    """Decode an 8-bit mask: foreground is above half of white or, where there are only 0 and 1, 1.
-
-    Raises:
-        DataError: as `decode`.
-    """
-    grey = np.asarray(_open(path).convert("L"))
-    return grey > (0 if grey.max() == 1 else 127)
 
 
 def stored_size(path: Path) -> tuple[int, int]:
@@ -65,7 +55,7 @@ def decode_levels(path: Path) -> Integer[np.ndarray, "height width"]:
     Raises:
         DataError: as `decode`, or the image has several channels or no whole numbers.
     """
-    image = _open(path)
+    image = open_image(path)
     levels = np.asarray(image)
     if levels.dtype == bool:
         levels = levels.astype(np.uint8)
@@ -101,7 +91,12 @@ def resize_nearest(
     return values[rows[:, None], columns]
 
 
-def _open(path: Path) -> Image.Image:
+def open_image(path: Path) -> Image.Image:
+    """The decoded image as Pillow has it.
+
+    Raises:
+        DataError: as `decode`.
+    """
     with _readable(path), Image.open(path) as image:
         image.load()
         return image

@@ -25,6 +25,7 @@ from nerfdiff.data import images
 from nerfdiff.data.bounds import Gaze
 from nerfdiff.data.framing import Framing
 from nerfdiff.data.index import folder_stamp
+from nerfdiff.data.masks import likely_misreading, read_mask, stacked_masks
 from nerfdiff.data.posed_files import MAX_POSITION
 from nerfdiff.data.posed_folders import find_scenes
 from nerfdiff.data.scene import Scene
@@ -65,6 +66,9 @@ class PosedImagesReader:
         image_size: (height, width), or one side of a square, to resize to, each image with intrinsics of its own;
             None keeps the stored size.
         crop: (height, width), or one side of a square, to cut out of the middle before; None keeps all.
+        inverted_masks: white marks the background in a frame's mask, as instant-ngp has it.
+        max_mask_border: share of the border that masks of objects may cover (`masks.likely_misreading`): a scene that
+            is read as a whole is refused where its masks look misread; None refuses none.
 
     Raises:
         ConfigError: settings that make no sense.
@@ -85,6 +89,8 @@ class PosedImagesReader:
         split_seed: int,
         image_size: int | Sequence[int] | None = None,
         crop: int | Sequence[int] | None = None,
+        inverted_masks: bool = False,
+        max_mask_border: float | None = 0.5,
     ):
         if not all(bound is None or bound > 0 for bound in (near, far)) or (near and far and near >= far):
             raise ConfigError(f"near = {near} and far = {far} must satisfy 0 < near < far, or be null")
@@ -92,12 +98,13 @@ class PosedImagesReader:
             raise ConfigError(f"convention {convention!r} is unknown; choose one of {', '.join(CONVENTIONS)}")
         self.near, self.far = near, far
         self.convention, self.inward, self.white_background = convention, inward, white_background
+        self.inverted_masks, self.max_mask_border = inverted_masks, max_mask_border
         self.framing = Framing.of(crop, image_size)
         root = Path(root)
         self.folders = find_scenes(root, split, split_sizes, split_seed)
         self.identity = (
             f"posed_images {root.resolve()} {split} {dict(split_sizes)} {split_seed} {self.framing} {convention} "
-            f"bounds {near} {far} white {white_background}"
+            f"bounds {near} {far} white {white_background} inverted masks {inverted_masks}"
         )
         self._parsed: dict[int, _PosedScene] = {}
         first = self._scene(0)
@@ -134,6 +141,9 @@ class PosedImagesReader:
         frames = every if views is None else [every[view] for view in views]
         files = [find_image(frame.image) for frame in frames]
         opened = [self._open(frame, file, truth) for frame, file in zip(frames, files, strict=True)]
+        masks, by_alpha = [mask for _, mask, _ in opened], all(frame.mask is None for frame in frames)
+        if views is None and self.white_background and not by_alpha:
+            self._refuse_misread(index, [mask for mask, frame in zip(masks, frames, strict=True) if frame.mask])
         pixels = stack_pixels([self.framing.image(image) for image, _, _ in opened], files)
         K = [self.framing.K(k, *image.shape[:2]) for image, _, k in opened]
         c2w = np.stack([frame.c2w for frame in frames])
@@ -144,7 +154,7 @@ class PosedImagesReader:
             cameras=Cameras(torch.from_numpy(c2w).float(), torch.from_numpy(np.stack(K)).float(), *pixels.shape[-2:]),
             near=scene.near,
             far=scene.far,
-            mask=self._truth([mask for _, mask, _ in opened]) if truth else None,
+            mask=stacked_masks(masks, self.framing, by_alpha) if truth else None,
         )
 
     def _open(
@@ -152,7 +162,7 @@ class PosedImagesReader:
     ) -> tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"] | None, Float[np.ndarray, "3 3"]]:
         """A frame's image, its foreground by mask or else, where `truth` asks for it, by transparency, and its K."""
         image, opaque = images.decode_with_alpha(file) if truth else (images.decode(file), None)
-        K, mask = frame.pinhole.K(*image.shape[:2]), _mask(frame, image.shape[:2])
+        K, mask = frame.pinhole.K(*image.shape[:2]), self._mask(frame, image.shape[:2])
         foreground = opaque if mask is None else mask
         if frame.lens is not None:
             image = frame.lens.image(image, K)
@@ -187,13 +197,26 @@ class PosedImagesReader:
             )
         return _PosedScene(transforms, float(near), float(far))
 
-    def _truth(
-        self, foreground: Sequence[Bool[np.ndarray, "height width"] | None]
-    ) -> Bool[torch.Tensor, "views new_height new_width"] | None:
-        """The views' framed foreground; None where one of them has neither mask nor transparency."""
-        if any(mask is None for mask in foreground):
+    def _mask(self, frame: Frame, size: tuple[int, int]) -> Bool[np.ndarray, "height width"] | None:
+        if frame.mask is None:
             return None
-        return torch.from_numpy(np.stack([self.framing.values(mask) for mask in foreground]))
+        mask = read_mask(frame.mask)
+        if mask.shape != size:
+            raise DataError(
+                f"{frame.mask}: {mask.shape[0]}x{mask.shape[1]} pixels, its image {frame.image.name} has "
+                f"{size[0]}x{size[1]}"
+            )
+        return ~mask if self.inverted_masks else mask
+
+    def _refuse_misread(self, index: int, masks: Sequence[Bool[np.ndarray, "_ _"]]) -> None:
+        """Before a misread mask leaves white images, or paints the object white."""
+        reason = None if self.max_mask_border is None else likely_misreading(masks, self.max_mask_border)
+        if reason is not None:
+            raise DataError(
+                f"{self.folders[index]}: {reason}. Where masks are white for the background, set "
+                f"data.reader.inverted_masks={str(not self.inverted_masks).lower()}; where they are right, "
+                "data.reader.max_mask_border=null; to leave images as they are, data.reader.white_background=false"
+            )
 
 
 def _half_angle(frames: Sequence[Frame]) -> float:
@@ -208,18 +231,6 @@ def _half_angle(frames: Sequence[Frame]) -> float:
         K = frame.pinhole.K(height, width)
         widest = max(widest, math.atan(max(width / K[0, 0], height / K[1, 1]) / 2))
     return widest
-
-
-def _mask(frame: Frame, size: tuple[int, int]) -> Bool[np.ndarray, "height width"] | None:
-    if frame.mask is None:
-        return None
-    mask = images.decode_mask(frame.mask)
-    if mask.shape != size:
-        raise DataError(
-            f"{frame.mask}: {mask.shape[0]}x{mask.shape[1]} pixels, its image {frame.image.name} has "
-            f"{size[0]}x{size[1]}"
-        )
-    return mask
 
 
 def _visible(folder: Path) -> list[Path]:

@@ -19,6 +19,7 @@ from nerfdiff.cameras import Cameras
 from nerfdiff.data import images
 from nerfdiff.data.fingerprint import fingerprint_folders
 from nerfdiff.data.framing import Framing
+from nerfdiff.data.masks import read_mask
 from nerfdiff.data.npz_files import read_depth
 from nerfdiff.data.posed_files import inverse_pose, read_pose
 from nerfdiff.data.scene import MissingSplit, Scene
@@ -155,7 +156,7 @@ class SRNReader:
         """`mask/<view>.png` or `depth/<view>.npz` of generated scenes; None where the folder is not there."""
         if not (folder.path / kind).is_dir():
             return None
-        read, suffix = (images.decode_mask, "png") if kind == "mask" else (read_depth, "npz")
+        read, suffix = (read_mask, "png") if kind == "mask" else (read_depth, "npz")
         values = []
         for name, size in zip(names, sizes, strict=True):
             file = folder.path / kind / f"{name}.{suffix}"

@@ -24,7 +24,7 @@ from nerfdiff.data.item_folders import item_folders
 from nerfdiff.data.masks import stacked_masks
 from nerfdiff.data.npz_files import read_depth
 from nerfdiff.data.optical_axes import ObjectCameras, check_settings, object_cameras, report
-from nerfdiff.data.scene import MissingSplit, Scene
+from nerfdiff.data.scene import Listing, MissingSplit, Scene
 from nerfdiff.data.split_file import stored_split
 from nerfdiff.data.view_stack import stack_pixels
 from nerfdiff.errors import ConfigError, DataError
@@ -107,6 +107,15 @@ class ABORenders:
     def geometry(self, index: int) -> ObjectCameras:
         """All cameras of a scene as the file has them: what convention was found, and what they look at."""
         return self._geometry(index, ItemTransforms.read(self.folders[index]))
+
+    def listing(self, index: int) -> Listing:
+        folder, transforms = self.folders[index], ItemTransforms.read(self.folders[index])
+        depth = (folder / "depth").is_dir()
+        files = {
+            name: [folder / f"{name}.png", *([folder / "depth" / f"{name}.npz"] if depth else [])]
+            for name in transforms.views
+        }
+        return Listing(self._geometry(index, transforms).normalised(self.distance).c2w, files)
 
     def load(self, index: int, views: Sequence[int] | None = None, truth: bool = False) -> Scene:
         transforms = ItemTransforms.read(self.folders[index])

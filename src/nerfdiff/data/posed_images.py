@@ -28,7 +28,7 @@ from nerfdiff.data.index import folder_stamp
 from nerfdiff.data.masks import likely_misreading, read_mask, stacked_masks
 from nerfdiff.data.posed_files import MAX_POSITION
 from nerfdiff.data.posed_folders import find_scenes
-from nerfdiff.data.scene import Scene
+from nerfdiff.data.scene import Listing, Scene
 from nerfdiff.data.transforms_json import Frame, Transforms, find_image, read_transforms
 from nerfdiff.data.view_stack import stack_pixels
 from nerfdiff.errors import ConfigError, DataError
@@ -135,6 +135,11 @@ class PosedImagesReader:
     def view_names(self, index: int) -> tuple[str, ...]:
         return tuple(frame.name for frame in self._scene(index).transforms.frames)
 
+    def listing(self, index: int) -> Listing:
+        transforms = self._scene(index).transforms
+        files = {f.name: [find_image(f.image), *([] if f.mask is None else [f.mask])] for f in transforms.frames}
+        return Listing(transforms.c2w, files)
+
     def load(self, index: int, views: Sequence[int] | None = None, truth: bool = False) -> Scene:
         scene = self._scene(index)
         every = scene.transforms.frames
@@ -189,6 +194,14 @@ class PosedImagesReader:
         far = self.far if self.far is not None else transforms.far
         if near is None or far is None:
             estimated = gaze.bounds(_half_angle(transforms.frames), folder)
+            strays = gaze.describe_strays([frame.name for frame in transforms.frames])
+            if strays is not None:
+                log.warning(
+                    "%s: %s; near and far are estimated without them. Mend their poses, or set data.reader.near and "
+                    "data.reader.far if they are right",
+                    folder,
+                    strays,
+                )
             near, far = estimated[0] if near is None else near, estimated[1] if far is None else far
         if not 0 < near < far < MAX_POSITION:
             raise DataError(

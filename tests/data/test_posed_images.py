@@ -381,6 +381,24 @@ def test_the_image_cache_keeps_each_scenes_bounds(tmp_path):
     assert reader.load(0).near != reader.load(1).near
 
 
+def test_a_stray_camera_is_named_and_does_not_set_the_bounds(tmp_path, caplog):
+    """Case 05: far went from 1.87 to 26.6 for all views."""
+    write_nerfstudio(tmp_path, views=12)
+    right = read(tmp_path).load(0)
+
+    def scatter(content):
+        for row in content["frames"][3]["transform_matrix"][:3]:
+            row[3] *= 20
+
+    assert "stray" not in caplog.text
+    edit(tmp_path / "transforms.json", scatter)
+    found = read(tmp_path).load(0)
+    assert (found.near, found.far) == pytest.approx((right.near, right.far), rel=0.05)
+    assert "stray cameras: view frame_00004 is" in caplog.text and "data.reader.near" in caplog.text
+    caplog.clear()
+    assert read(tmp_path, near=1.0, far=90.0).load(0).far == 90.0 and "stray" not in caplog.text
+
+
 def test_the_configuration_reads_a_scene(tmp_path):
     write_nerfstudio(tmp_path, scales=(1, 2))
     cfg = load_config("train", ["data=posed_images", f"data.root={tmp_path}", "data.reader.far=9.5"])

@@ -50,6 +50,7 @@ def test_equals_the_reader(root):
     for index in range(4):
         assert copy.scene_id(index) == reader.scene_id(index)
         assert copy.view_names(index) == reader.view_names(index)
+        assert copy.listing(index).files == reader.listing(index).files
         for views in (None, [2, 0, 2], [-1]):
             here, there = copy.load(index, views), reader.load(index, views)
             assert (here.id, here.views, here.near, here.far) == (there.id, there.views, there.near, there.far)

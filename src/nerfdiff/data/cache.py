@@ -27,7 +27,7 @@ from rich.progress import track
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras
-from nerfdiff.data.scene import Scene, SceneReader
+from nerfdiff.data.scene import Listing, Scene, SceneReader
 from nerfdiff.errors import DataError
 
 FORMAT = "3"  # to be raised when the files above change their meaning, or readers decode other pixels
@@ -82,6 +82,9 @@ class CachedReader:
 
     def view_names(self, index: int) -> tuple[str, ...]:
         return self._views[index]
+
+    def listing(self, index: int) -> Listing:
+        return self.reader.listing(index)
 
     def load(self, index: int, views: Sequence[int] | None = None, truth: bool = False) -> Scene:
         if truth:

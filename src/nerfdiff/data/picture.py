@@ -14,7 +14,8 @@ from PIL.ExifTags import Base
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.batch import Sample, ViewBatch
-from nerfdiff.data.images import decode_mask, decode_with_alpha
+from nerfdiff.data.images import decode_with_alpha
+from nerfdiff.data.masks import read_mask
 from nerfdiff.data.scene import Scene
 from nerfdiff.errors import ConfigError, DataError
 
@@ -99,7 +100,7 @@ class Picture:
         told = opaque is not None and not opaque.all()  # many programs write an alpha that says nothing
         where = opaque if told else (pixels < 255 * self.white).any(-1)
         if self.mask is not None:
-            mask = _upright(decode_mask(Path(self.mask)), Path(self.mask))
+            mask = _upright(read_mask(Path(self.mask)), Path(self.mask))
             if mask.shape != pixels.shape[:2]:
                 (h, w), (rows, columns) = mask.shape, pixels.shape[:2]
                 raise DataError(

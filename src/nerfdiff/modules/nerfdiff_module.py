@@ -13,7 +13,7 @@ from torch import Tensor
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.diffusion.schedule import add_noise, alpha_sigma, expand, v_from_x0_eps
 from nerfdiff.errors import ConfigError
-from nerfdiff.metrics.image import psnr
+from nerfdiff.metrics.image import psnr, psnr_of_mse
 from nerfdiff.model import NerfDiff
 from nerfdiff.randomness import generator, spread_times
 
@@ -53,7 +53,7 @@ class NerfDiffModule(LightningModule):
         times = spread_times(batch.draws, self.hparams.seed)
         loss_ic, loss_dm = self._losses(batch, times, **noise)
         loss = self.hparams.losses["lambda_ic"] * loss_ic + self.hparams.losses["lambda_dm"] * loss_dm
-        values = {"loss": loss, "loss_ic": loss_ic, "loss_dm": loss_dm, "psnr": _psnr_of_mse(loss_ic)}
+        values = {"loss": loss, "loss_ic": loss_ic, "loss_dm": loss_dm, "psnr": psnr_of_mse(loss_ic.detach())}
         size = len(batch)
         self.log_dict({f"train/{name}": value.detach() for name, value in values.items()}, batch_size=size)
         self.log("psnr", values["psnr"].detach(), prog_bar=True, logger=False, batch_size=size)
@@ -138,7 +138,3 @@ class NerfDiffModule(LightningModule):
             "jitter": torch.stack([torch.rand(rays, samples, generator=g, device=g.device) for g in generators]),
             "eps": torch.stack([torch.randn(targets.shape[1:], generator=g, device=g.device) for g in generators]),
         }
-
-
-def _psnr_of_mse(mse: Tensor) -> Tensor:
-    return -10 * torch.log10(mse.detach() + 1e-6)

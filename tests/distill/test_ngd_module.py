@@ -138,6 +138,11 @@ def test_a_scene_that_fails_leaves_the_others_alone():
     assert torch.equal(module.field.planes[1:], start)  # it failed at once: what was good is where it began
 
 
+def test_no_virtual_views_are_refused():
+    with pytest.raises(ConfigError, match=r"no virtual views: set budget\.views"):
+        distillation(TEACHERS["ngd"], views=0).distil(model().requires_grad_(False), [scene()], seed=0)
+
+
 def test_scenes_that_do_not_fit_into_one_batch_are_refused():
     net = model().requires_grad_(False)
     views = {"a": 2, "b": 3}

@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 import torch
 
-from nerfdiff.metrics.image import dequantise, gradient_energy, psnr, psnr_of_mse, quantise, sharpness, ssim, ssim_gaussian
+from nerfdiff.metrics.image import (
+    dequantise,
+    gradient_energy,
+    psnr,
+    psnr_of_mse,
+    quantise,
+    sharpness,
+    ssim,
+    ssim_gaussian,
+)
 
 
 def picture_pair(n=2, size=16, seed=0):

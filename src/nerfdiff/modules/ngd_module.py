@@ -129,7 +129,7 @@ class NGDModule(LightningModule):
         self._start = self.field.snapshot()
         self._good = self._start
         self._finite = torch.ones(len(self.field), dtype=torch.bool, device=self.device)
-        self._heard = torch.ones(len(self.field), dtype=torch.bool, pin_memory=self.device.type == "cuda")
+        self._finite_on_host = torch.ones(len(self.field), dtype=torch.bool, pin_memory=self.device.type == "cuda")
         self._fitted = self.cameras
         if self.fit_source:
             both = zip(self.cameras, self.field.cameras, strict=True)
@@ -147,7 +147,7 @@ class NGDModule(LightningModule):
 
     def on_train_batch_start(self, step: int, batch_idx: int) -> int | None:
         """Ends the run (-1) when every scene is lost."""
-        self._alive = self._heard.tolist()
+        self._alive = self._finite_on_host.tolist()
         return None if any(self._alive) else -1
 
     def training_step(self, step: int, batch_idx: int) -> None:
@@ -221,7 +221,9 @@ class NGDModule(LightningModule):
     def _keep_what_is_good(self, losses: Float[Tensor, "steps scenes"], targets: SceneImages) -> None:
         """Note which scenes are well, on the device: nobody waits to hear it. One that is not stays lost."""
         self._finite &= torch.isfinite(losses).all(0) & self.field.finite() & torch.isfinite(targets).flatten(1).all(1)
-        self._heard.copy_(self._finite, non_blocking=True)  # read without waiting: on a GPU it may be a step old
+        self._finite_on_host.copy_(
+            self._finite, non_blocking=True
+        )  # read without waiting: on a GPU it may be a step old
         if self._good is self._start:
             self._last_targets = targets
         keep = self._finite.reshape(-1, 1, 1, 1, 1)

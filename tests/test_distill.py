@@ -18,8 +18,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from nerfdiff.cli import load_config
 from nerfdiff.distill.distillation import Distillation
 from nerfdiff.distill.field_file import FIELD, load_field
+from nerfdiff.distill.priors.sphere import Sphere
 from nerfdiff.errors import ConfigError, DataError, TimeUp
-from nerfdiff.evaluation.distill import distill
+from nerfdiff.evaluation.distill import _warn_of_inert, distill
 from nerfdiff.evaluation.subject import dataset_subject
 from nerfdiff.metrics.predictions import read_prediction
 from nerfdiff.modules.ngd_module import NGDModule
@@ -93,6 +94,50 @@ def test_every_scene_leaves_its_field_views_orbit_and_trace(strategy, data, run,
     events = EventAccumulator(str(next((tmp_path / "tensorboard" / "curves").iterdir()))).Reload()
     assert len(events.Scalars("distill/agreement")) == STEPS and len(events.Scalars("scenes/psnr")) == 2
     assert next(tmp_path.glob(f"{strategy}-*/sheet.png")).stat().st_size > 1000
+
+
+def test_k_is_the_number_of_views_that_fields_were_fitted_to(data, run, tmp_path, caplog):
+    """Π of the scene's own views: the input view and 4 others, or 2 by eval_stride, whatever is asked for."""
+    small = "sheet.scenes=0", "orbit.frames=0", "budget.inner_steps=1", "budget.steps=2"
+    for stride, asked, used in ((1, 4, 4), (1, 9, 5), (2, 9, 3)):
+        settings = "prior=abo_views", f"budget.views={asked}", f"data.eval_stride={stride}", *small
+        row = distill(config(data, run, tmp_path, *settings))
+        assert (row.K, row.prior) == (used, "OwnViews")
+        assert row.denoiser_calls == 2 * 2 * used  # scenes, steps
+        assert (f"{used} virtual views instead of the {asked}" in caplog.text) == (used < asked)
+    none = distill(config(data, run, tmp_path, "strategy=none", *small))
+    assert none.K is none.prior is None
+
+
+def test_scenes_with_different_numbers_of_views_are_told(data, run, tmp_path, monkeypatch, caplog):
+    """The row's K is the most; a prior needs nothing but to be called."""
+
+    class Odd:
+        def __call__(self, scene):
+            return Sphere(2 if scene.scene_ids[0] == "scene0" else 3, (0.0, 20.0), (-90.0, 90.0), 20.0)(scene)
+
+    cfg = config(data, run, tmp_path, "sheet.scenes=0", "orbit.frames=0")
+    monkeypatch.setattr(
+        "nerfdiff.evaluation.distill._strategy",
+        lambda cfg: dataclasses.replace(instantiate(cfg.strategy, _convert_="all"), prior=Odd()),
+    )
+    row = distill(cfg)
+    assert (row.K, row.prior) == (3, "Odd") and "scenes had 2 to 3 virtual views" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["image=car.png", "prior=abo_views", "+data.eval_stride=2"],
+            "prior=abo_views, +data.eval_stride=2 cannot act",
+        ),
+        (["image=car.png", "picture_views.views=3", "prior_of_mine=1"], None),
+    ],
+)
+def test_what_cannot_act_on_a_picture_is_said(words, said, caplog):
+    _warn_of_inert(words)
+    assert caplog.text == "" if said is None else said in caplog.text
 
 
 @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])

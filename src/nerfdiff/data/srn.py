@@ -55,8 +55,8 @@ class SRNReader:
 
     Raises:
         ConfigError: an unknown category or split, or bounds that are not 0 < near < far.
-        MissingSplit: `root` has no such split; the message lists what was looked for.
-        DataError: `root` is missing or empty, or the split has no scenes.
+        MissingSplit: `root` has no such split, or no scenes in it; the message lists what was looked for.
+        DataError: `root` is missing or empty.
     """
 
     nearest_view = False
@@ -84,7 +84,7 @@ class SRNReader:
             sorted(e.name for e in os.scandir(self.folder) if e.is_dir() and not e.name.startswith("."))
         )
         if not self.scenes:
-            raise DataError(f"{self.folder}: the {split} split is empty; expected one folder per scene in it")
+            raise MissingSplit(f"{self.folder}: the {split} split is empty; expected one folder per scene in it")
         self.identity = f"srn {self.folder.resolve()} {self.framing} bounds {self.near} {self.far}"
         self._listed: dict[int, _Folder] = {}
 

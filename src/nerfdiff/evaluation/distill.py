@@ -1,6 +1,8 @@
 """One strategy over the scenes of a dataset, or over one picture, on one or several processes."""
 
 import logging
+import re
+from collections.abc import Sequence
 from datetime import timedelta
 
 import torch
@@ -71,7 +73,14 @@ def _strategy(cfg: DictConfig) -> Strategy:
     settings = plain(cfg.strategy)
     if cfg.image and "prior" in settings:
         settings["prior"] = plain(cfg.picture_views)
+        _warn_of_inert(HydraConfig.get().overrides.task if HydraConfig.initialized() else ())
     return instantiate(settings)
+
+
+def _warn_of_inert(overrides: Sequence[str]) -> None:
+    aside = [word for word in overrides if re.match(r"[+~]*(prior|data)\b", word)]
+    if aside:
+        log.warning("%s cannot act on a picture: it is seen from picture_views, and needs no dataset", ", ".join(aside))
 
 
 def _rank() -> int:

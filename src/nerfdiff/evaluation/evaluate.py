@@ -9,6 +9,8 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from rich.console import Console
 
+from nerfdiff.data.datamodule import SceneDataModule
+from nerfdiff.data.scene import MissingSplit
 from nerfdiff.distill.baselines import CopyInput, MeanImage, mean_training_image
 from nerfdiff.distill.strategy import Strategy
 from nerfdiff.evaluation.dashboard import show_in_dashboard
@@ -31,7 +33,7 @@ def evaluate(cfg: DictConfig) -> list[ResultRow]:
     predicted again.
 
     Returns:
-        the strategy's row, then the baselines'.
+        the strategy's row, then the baselines'; of these the mean image only where there are training images.
 
     Raises:
         UserError: bad data, config or checkpoint. A strategy that fails is appended as a row with its status first.
@@ -40,10 +42,7 @@ def evaluate(cfg: DictConfig) -> list[ResultRow]:
         torch.set_num_threads(cfg.threads)
     subject = dataset_subject(cfg, choose_device(cfg.device))
     reader = subject.data.reader("test")
-    strategies: list[Strategy] = [instantiate(cfg.strategy)]
-    if cfg.baselines:
-        mean = mean_training_image(subject.data.reader("train"), cfg.mean_image_scenes, cfg.seed)
-        strategies += [CopyInput(), MeanImage(mean)]
+    strategies: list[Strategy] = [instantiate(cfg.strategy), *(_baselines(cfg, subject.data) if cfg.baselines else ())]
     scorer = instantiate(cfg.metrics)
     rows = []
     for strategy in strategies:
@@ -62,6 +61,16 @@ def evaluate(cfg: DictConfig) -> list[ResultRow]:
     show(rows, subject.folder / "table.md")
     log.info("rows: %s   scores per image and scene: %s", cfg.results, subject.folder / "scores")
     return rows
+
+
+def _baselines(cfg: DictConfig, data: SceneDataModule) -> list[Strategy]:
+    """What knows nothing of 3D; without the mean training image where only the test split was downloaded."""
+    try:
+        reader = data.reader("train")
+    except MissingSplit as error:
+        log.warning("the baseline mean_image is left out: it needs training images, and there are none (%s)", error)
+        return [CopyInput()]
+    return [CopyInput(), MeanImage(mean_training_image(reader, cfg.mean_image_scenes, cfg.seed))]
 
 
 def show(rows: list[ResultRow], path: Path) -> None:

@@ -72,7 +72,6 @@ def _identified(subject: Subject, strategy: Strategy) -> ResultRow:
         folder=os.path.relpath(subject.folder, Path(cfg.results).parent),
         strategy=strategy.name,
         prior=prior and type(prior).__name__,
-        K=prior and prior.views,
         **_asked_for(cfg),
         **environment(subject.device, subject.precision),
         **{key: subject.identity[key] for key in ("ckpt_sha256", "weights", "split_sha256", "image_size")},

@@ -121,6 +121,7 @@ def _write(
             "peak_mem_bytes": _peak_memory(subject.device),
             "denoiser_calls": views.denoiser_calls,
             "field_queries": views.field_queries,
+            "virtual_views": views.virtual_views,
         },
         status=views.status,
         beside=partial(_leave, subject, strategy, scene, views),

@@ -19,7 +19,7 @@ from nerfdiff.diffusion.schedule import add_noise, alpha_sigma, expand, v_from_x
 from nerfdiff.errors import ConfigError
 from nerfdiff.field.encoder import Encoding
 from nerfdiff.field.triplane import Triplane
-from nerfdiff.metrics.image import psnr
+from nerfdiff.metrics.image import psnr, psnr_of_mse
 from nerfdiff.model import NerfDiff
 from nerfdiff.modules.kept_renderings import KeptRenderings
 from nerfdiff.randomness import generator, spread_times
@@ -85,7 +85,7 @@ class NerfDiffModule(LightningModule):
         noise = self._noise(batch, losses)
         loss_ic, rendering = self._photometric(batch, encoding, noise, losses)
         loss = losses["lambda_ic"] * loss_ic
-        values = {"loss_ic": loss_ic, "psnr": _psnr_of_mse(loss_ic)}
+        values = {"loss_ic": loss_ic, "psnr": psnr_of_mse(loss_ic.detach())}
         if losses["lambda_dm"]:
             loss_dm = self._diffusion(batch, encoding, rendering, noise["eps"])
             loss = loss + losses["lambda_dm"] * loss_dm
@@ -269,7 +269,3 @@ def _check_losses(losses: Mapping, kept_renderings: str | None) -> None:
         )
     if kept_renderings and ic:
         raise ConfigError("kept_renderings are of a field that does not change: set losses.lambda_ic=0, or it to null")
-
-
-def _psnr_of_mse(mse: Tensor) -> Tensor:
-    return -10 * torch.log10(mse.detach() + 1e-6)

@@ -40,10 +40,11 @@ class ResultRow:
     virtual views, which the denoiser sees and is guided by) are parts of it. `timing_s` are the seconds per scene that
     measuring cost the run. `peak_mem_bytes` is what a GPU had allocated; on a CPU the process's resident set, with what
     earlier jobs of a sweep left in it. `backend` is what rendered: `triton`, `torch`, or `cpu`, which is PyTorch in the
-    order that suits a CPU. `samples_per_ray` counts coarse and fine ones. `fid_n` is the number of images on either
-    side of `fid` and `fd_st_vgg`; `n_views` counts all scored images; `consistency_n` scenes were measured for
-    consistency. `fallbacks` counts the scenes whose distillation failed and which kept an earlier field; `error` says
-    how; where all did, the status is `diverged`. The three after it are of the training run that made the checkpoint.
+    order that suits a CPU. `samples_per_ray` counts coarse and fine ones. `K` counts the virtual views that fields were
+    fitted to, the most of any scene. `fid_n` is the number of images on either side of `fid` and `fd_st_vgg`; `n_views`
+    counts all scored images; `consistency_n` scenes were measured for consistency. `fallbacks` counts the scenes whose
+    distillation failed and which kept an earlier field; `error` says how; where all did, the status is `diverged`. The
+    three after it are of the training run that made the checkpoint.
     """
 
     # identity

@@ -12,12 +12,13 @@ from lightning import Trainer, seed_everything
 from omegaconf import DictConfig, OmegaConf
 
 from nerfdiff.callbacks.checkpoint import ClearCheckpointIO
-from nerfdiff.checkpoint import check_resumable, export_model, last_checkpoint, load_model
+from nerfdiff.checkpoint import check_resumable, export_model, load_model
 from nerfdiff.compilation import compile_unets
 from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.diffusion.layout import channels_last
 from nerfdiff.diffusion.unet import AUTO
 from nerfdiff.errors import CheckpointError, ConfigError
+from nerfdiff.inputs import last_checkpoint
 from nerfdiff.memory import WEIGHTS_ADAM_EMA, is_tight, within_memory
 from nerfdiff.modules.nerfdiff_module import NerfDiffModule
 

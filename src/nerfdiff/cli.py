@@ -43,8 +43,9 @@ EITHER: dict[str, tuple[type, ...]] = {
 }
 OPTIONAL_GROUPS = ("logger", "experiment", "sweep")
 MULTIRUN = ("-m", "--multirun")
-# Options with which a command shows something and runs nothing.
+# Options with which a command shows something and runs nothing, or runs another config.
 SHOWING = ("-h", "--help", "--hydra-help", "--version", "-c", "--cfg", "-i", "--info")
+OTHER_CONFIG = ("-cp", "--config-path", "-cn", "--config-name", "-cd", "--config-dir", "--experimental-rerun")
 COMPLETING = ("-sc", "--shell-completion")
 EXCLUDED = "hydra.job.config.override_dirname.exclude_keys"
 MAX_FOLDER = 100
@@ -84,7 +85,7 @@ def entry_point(config_name: str, *inputs: str) -> Callable[[Callable[[DictConfi
         @functools.wraps(function)
         def main() -> None:
             try:
-                sys.argv[1:] = _prepare(config_name, inputs, sys.argv[1:])
+                sys.argv[1:] = prepare_arguments(config_name, inputs, sys.argv[1:])
             except UserError as error:
                 sys.exit(f"error: {error}")
             keep_freed_memory()
@@ -100,15 +101,15 @@ def command_words(name: str) -> list[str]:
     return ["python", f"src/{name}.py"] if CHECKOUT else [f"nerfdiff-{name.replace('_', '-')}"]
 
 
-def job_folder(swept: str, overrides: Sequence[str]) -> str:
+def job_folder(swept: str, overrides: Sequence[str] = ()) -> str:
     """The name of the folder of a sweep's job, which every file system takes and which may stand in an override.
 
     Args:
-        swept: the overrides that tell the sweep's jobs apart.
-        overrides: all overrides of the job, whose hash ends the name.
+        swept: the overrides that tell the sweep's jobs apart; they name it.
+        overrides: others that the hash at the name's end is of as well.
     """
-    digest = sha256_values(sorted(overrides))[:8]
-    return f"{re.sub(r'[^a-zA-Z0-9_.]+', '-', swept)[:MAX_FOLDER].strip('-.')}-{digest}".lstrip("-")
+    name = re.sub(r"[^a-zA-Z0-9_.]+", "-", swept)[:MAX_FOLDER].strip("-.")
+    return "-".join(filter(None, [name, sha256_values([swept, *sorted(overrides)])[:8]]))
 
 
 OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
@@ -150,7 +151,7 @@ def load_config(config_name: str, overrides: list[str]) -> DictConfig:
     return _compose(config_name, overrides)
 
 
-def _prepare(config_name: str, inputs: Sequence[str], arguments: list[str]) -> list[str]:
+def prepare_arguments(config_name: str, inputs: Sequence[str], arguments: list[str]) -> list[str]:
     """A command's arguments as Hydra is to read them, after they were checked.
 
     Raises:
@@ -161,12 +162,14 @@ def _prepare(config_name: str, inputs: Sequence[str], arguments: list[str]) -> l
         return arguments
     arguments = quote_values(arguments)
     check_overrides(config_name, arguments)
-    if not options.isdisjoint(SHOWING):
+    if not options.isdisjoint((*SHOWING, *OTHER_CONFIG)):
         return arguments
     overrides = _overrides(arguments)
     swept = {override.key_or_group for override in overrides if override.is_sweep_override()}
     fixed = {override.key_or_group: override for override in overrides if override.key_or_group not in swept}
-    config = _compose(config_name, [override.input_line for override in fixed.values()], with_hydra=True)
+    words = [_choices(override)[0].input_line for override in overrides if _is_group(override)]
+    words += [override.input_line for override in fixed.values() if not _is_group(override)]
+    config = _compose(config_name, words, with_hydra=True)
     if options.isdisjoint(MULTIRUN) and config.hydra.mode != RunMode.MULTIRUN:
         check_inputs(config, inputs)
         return arguments

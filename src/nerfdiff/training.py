@@ -62,7 +62,7 @@ def train(cfg: DictConfig) -> dict[str, float]:
     if trainer.is_global_zero:
         output_dir.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(cfg, output_dir / "config.yaml", resolve=True)
-    _announce(module, last)
+    _announce(module, last, trainer.strategy.root_device)
 
     trainer.fit(module, datamodule, ckpt_path=last, weights_only=True)
 
@@ -133,7 +133,7 @@ def _checkpoint_to_resume(output_dir: Path, cfg: DictConfig, model_config: dict)
     return last
 
 
-def _announce(module: NerfDiffModule, last: Path | None) -> None:
+def _announce(module: NerfDiffModule, last: Path | None, device: torch.device) -> None:
     counts = module.model.parameter_count()
     state = WEIGHTS_ADAM_EMA * counts["total"] / 2**30
     log.info(
@@ -143,4 +143,4 @@ def _announce(module: NerfDiffModule, last: Path | None) -> None:
         *(counts[part] / 1e6 for part in ("total", "encoder", "denoiser")),
         state,
     )
-    log.info("resuming from %s", last) if last else log.info("starting afresh")
+    log.info("%s on %s", f"resuming from {last}" if last else "starting afresh", device)

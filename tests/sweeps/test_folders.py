@@ -31,6 +31,7 @@ def folders(tmp_path, monkeypatch):
 
 
 def test_folders_are_named_by_what_is_swept(folders):
+    # the same command goes on in the same folders; other data have others
     fixed = ["data=posed_images", f"run_name={'x' * 300}", "data.image_size=[32,32]", "optimizer.lr=1e-3,2e-3"]
     here = folders("train", "-m", *fixed, "seed=choice(3)", "data.root=/a=b/c d/é")
     for words, name in here.items():

@@ -21,7 +21,7 @@ from nerfdiff.distill.field_file import FIELD, load_field
 from nerfdiff.distill.priors.sphere import Sphere
 from nerfdiff.errors import ConfigError, DataError, TimeUp
 from nerfdiff.evaluation.distill import _warn_of_inert, distill
-from nerfdiff.evaluation.subject import dataset_subject
+from nerfdiff.evaluation.subject import dataset_subject, picture_subject
 from nerfdiff.metrics.predictions import read_prediction
 from nerfdiff.modules.ngd_module import NGDModule
 from nerfdiff.results.row import read_rows
@@ -251,6 +251,14 @@ def picture(tmp_path):
     path = tmp_path / "red car.png"
     Image.fromarray(pixels).save(path)
     return path
+
+
+def test_equal_pictures_of_several_names_are_scenes_of_their_own(data, run, tmp_path, picture):
+    other = picture.with_name("a=b, c (1).png")
+    shutil.copy(picture, other)
+    configs = [config(data, run, tmp_path, f"image={path}") for path in (picture, other)]
+    first, second = (picture_subject(cfg, torch.device("cpu")) for cfg in configs)
+    assert (first.scene_ids, second.scene_ids) == (["red_car"], ["a_b_c_1"]) and first.folder != second.folder
 
 
 @pytest.mark.parametrize("strategy", ["none", "cdm", "ngd"])

@@ -1,4 +1,5 @@
 import json
+import os
 import shutil
 
 import pytest
@@ -212,7 +213,10 @@ def test_what_this_machine_cannot_do_is_said(data, run, tmp_path, setting, word)
 
 
 def test_weights_can_be_shared_at_half_the_size(run, tmp_path):
+    umask = os.umask(0o027)
     whole = export(str(run), "ema", tmp_path / "whole", "float32", tmp_path)
+    os.umask(umask)
+    assert [path.stat().st_mode & 0o777 for path in whole.parent.iterdir()] == [0o640, 0o640]
     half = export(str(run), "ema", tmp_path / "half", "float16", tmp_path)
     assert half.stat().st_size < 0.6 * whole.stat().st_size
     first, second = (load_model(path.parent, "ema", tmp_path).model.state_dict() for path in (whole, half))

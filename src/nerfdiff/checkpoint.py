@@ -13,10 +13,10 @@ from safetensors.torch import load_file, save_file
 
 from nerfdiff.errors import CheckpointError, ConfigError
 from nerfdiff.field.kinds import TRIPLANE
+from nerfdiff.inputs import WEIGHTS, find_weights
 from nerfdiff.model import NerfDiff
 from nerfdiff.results.files import atomic, write_text
 
-WEIGHTS = "model.safetensors"
 CONFIG = "model.yaml"
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 _PREFIX = "model."
@@ -43,29 +43,19 @@ class LoadedModel:
     stability: Mapping[str, float | int | None]
 
 
-def load_model(ckpt: str | Path, weights: str, assets: str | Path) -> LoadedModel:
+def load_model(ckpt: str | Path, weights: str, assets: str | Path | None = None) -> LoadedModel:
     """Read a model with the sizes it was trained with.
 
     Args:
-        ckpt: a Lightning `.ckpt`; a run's folder (its last checkpoint); a folder written by `export_model`; or the
-            name of such a folder in `assets`, as `demo`.
+        ckpt, assets: see `find_weights`.
         weights: `ema`, the average that the paper evaluates, or `raw`.
-        assets: folder of shipped models.
 
     Raises:
         CheckpointError: no such file, not a checkpoint of this project, or it lacks these weights.
     """
     if weights not in ("ema", "raw"):
         raise CheckpointError(f"weights must be ema or raw, got {weights!r}")
-    candidates = [Path(ckpt), last_checkpoint(ckpt), Path(ckpt) / WEIGHTS]
-    candidates.append(Path(assets) / ckpt / WEIGHTS)
-    path = next((c for c in candidates if c.is_file()), None)
-    if path is None:
-        shipped = sorted(p.parent.name for p in Path(assets).glob(f"*/{WEIGHTS}"))
-        raise CheckpointError(
-            f"ckpt={ckpt} is neither a file nor a folder of a run; looked for "
-            f"{', '.join(map(str, candidates))}. Shipped models: {', '.join(shipped) or 'none'}"
-        )
+    path = find_weights(ckpt, assets)
     read = _read_export if path.suffix == ".safetensors" else _read_ckpt
     config, image_size, stability, state = read(path, weights)
     return LoadedModel(_build(config, state, path), path, weights, config, image_size, stability)
@@ -106,7 +96,7 @@ def export_model(loaded: LoadedModel, folder: str | Path, dtype: torch.dtype) ->
     return folder / WEIGHTS
 
 
-def export(ckpt: str, weights: str, out: str | Path, dtype: str, assets: str | Path) -> Path:
+def export(ckpt: str, weights: str, out: str | Path, dtype: str, assets: str | Path | None) -> Path:
     """`load_model`, then `export_model`; returns the file.
 
     Raises:
@@ -196,8 +186,3 @@ def _build(config: Mapping, state: dict[str, torch.Tensor], path: Path) -> NerfD
     except (TypeError, KeyError, RuntimeError) as error:
         raise CheckpointError(f"{path} does not fit its own settings: {error}") from error
     return model.eval()
-
-
-def last_checkpoint(run: str | Path) -> Path:
-    """Where a run keeps the checkpoint it resumes from."""
-    return Path(run) / "checkpoints" / "last.ckpt"

@@ -3,9 +3,11 @@
 import difflib
 import functools
 import os
+import re
+import shlex
 import sys
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import hydra
 from hydra import compose, initialize_config_dir
@@ -20,8 +22,10 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nerfdiff.cpu_memory import keep_freed_memory
 from nerfdiff.errors import ConfigError, UserError
-
-CONF = Path(__file__).parents[2] / "conf"
+from nerfdiff.inputs import CHECKOUT, CONF, check_inputs
+from nerfdiff.noise import quieten
+from nerfdiff.quoting import parse_override, quote_values
+from nerfdiff.results.hashes import sha256_values
 
 # What a value must be, by the type of its default.
 KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
@@ -38,19 +42,33 @@ EITHER: dict[str, tuple[type, ...]] = {
     "checkpointing": (bool, list, str),  # everywhere or nowhere, at some resolutions, or auto
 }
 OPTIONAL_GROUPS = ("logger", "experiment", "sweep")
+MULTIRUN = ("-m", "--multirun")
+# Options with which a command shows something and runs nothing, or runs another config.
+SHOWING = ("-h", "--help", "--hydra-help", "--version", "-c", "--cfg", "-i", "--info")
+OTHER_CONFIG = ("-cp", "--config-path", "-cn", "--config-name", "-cd", "--config-dir", "--experimental-rerun")
+COMPLETING = ("-sc", "--shell-completion")
+EXCLUDED = "hydra.job.config.override_dirname.exclude_keys"
+MAX_FOLDER = 100
+"""Characters of the name of a sweep's job before its hash; file systems take 255 bytes."""
 
 
-def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], object]], Callable[[], None]]:
+def entry_point(config_name: str, *inputs: str) -> Callable[[Callable[[DictConfig], object]], Callable[[], None]]:
     """Make a function of a config into a command.
 
-    Overrides are checked against the composed defaults: an unknown key or a value of the wrong kind ends the
-    command with the keys that exist. What `explain` knows ends it with one line and exit status 1;
-    HYDRA_FULL_ERROR=1 gives the traceback instead.
+    Values that Hydra's grammar would misread are quoted for it. Overrides are checked against the composed defaults:
+    an unknown key or a value of the wrong kind ends the command with the keys that exist, and so does a checkpoint,
+    picture or folder that is not there, before anything slow is imported. What `explain` knows ends it with one line
+    and exit status 1; HYDRA_FULL_ERROR=1 gives the traceback instead.
+
+    Args:
+        config_name: of the file in conf/.
+        inputs: keys of what the command reads, see `check_inputs`.
     """
 
     def decorate(function: Callable[[DictConfig], object]) -> Callable[[], None]:
         @functools.wraps(function)
         def run(cfg: DictConfig) -> object:
+            quieten()
             try:
                 return function(cfg)
             except Exception as error:
@@ -67,8 +85,8 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], object]], 
         @functools.wraps(function)
         def main() -> None:
             try:
-                check_overrides(config_name, sys.argv[1:])
-            except ConfigError as error:
+                sys.argv[1:] = prepare_arguments(config_name, inputs, sys.argv[1:])
+            except UserError as error:
                 sys.exit(f"error: {error}")
             keep_freed_memory()
             command()
@@ -76,6 +94,25 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], object]], 
         return main
 
     return decorate
+
+
+def command_words(name: str) -> list[str]:
+    """The shell command of an entry point: from the project's folder, or as it is installed."""
+    return ["python", f"src/{name}.py"] if CHECKOUT else [f"nerfdiff-{name.replace('_', '-')}"]
+
+
+def job_folder(swept: str, overrides: Sequence[str] = ()) -> str:
+    """The name of the folder of a sweep's job, which every file system takes and which may stand in an override.
+
+    Args:
+        swept: the overrides that tell the sweep's jobs apart; they name it.
+        overrides: others that the hash at the name's end is of as well.
+    """
+    name = re.sub(r"[^a-zA-Z0-9_.]+", "-", swept)[:MAX_FOLDER].strip("-.")
+    return "-".join(filter(None, [name, sha256_values([swept, *sorted(overrides)])[:8]]))
+
+
+OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
 
 
 def explain(error: BaseException) -> str | None:
@@ -109,8 +146,55 @@ def load_config(config_name: str, overrides: list[str]) -> DictConfig:
     Raises:
         ConfigError: an override names no key, or its value is of the wrong kind.
     """
+    overrides = quote_values(overrides)
     check_overrides(config_name, overrides)
     return _compose(config_name, overrides)
+
+
+def prepare_arguments(config_name: str, inputs: Sequence[str], arguments: list[str]) -> list[str]:
+    """A command's arguments as Hydra is to read them, after they were checked.
+
+    Raises:
+        UserError: they are wrong, or a file or folder that they name is not there.
+    """
+    options = {word.partition("=")[0] for word in arguments if word.startswith("-")}
+    if not options.isdisjoint(COMPLETING):
+        return arguments
+    arguments = quote_values(arguments)
+    check_overrides(config_name, arguments)
+    if not options.isdisjoint((*SHOWING, *OTHER_CONFIG)):
+        return arguments
+    overrides = _overrides(arguments)
+    swept = {override.key_or_group for override in overrides if override.is_sweep_override()}
+    fixed = {override.key_or_group: override for override in overrides if override.key_or_group not in swept}
+    words = [_choices(override)[0].input_line for override in overrides if _is_group(override)]
+    words += [override.input_line for override in fixed.values() if not _is_group(override)]
+    config = _compose(config_name, words, with_hydra=True)
+    if options.isdisjoint(MULTIRUN) and config.hydra.mode != RunMode.MULTIRUN:
+        check_inputs(config, inputs)
+        return arguments
+    check_inputs(config, inputs, swept=swept | set(config.hydra.sweeper.get("params") or ()), only=fixed)
+    # jobs, in whatever process, are to name their folders by what is swept
+    untold = [key for key, override in fixed.items() if not override.is_hydra_override()]
+    return [*arguments, f"{EXCLUDED}=[{','.join(untold)}]"]
+
+
+def _overrides(arguments: list[str]) -> list[Override]:
+    """The `key=value` words among a command's arguments.
+
+    Raises:
+        ConfigError: Hydra cannot read one, or a word is none.
+    """
+    for before, word in pairwise(["", *arguments]):
+        if not word.startswith(("-", "~")) and "=" not in word and not before.startswith("-"):
+            raise ConfigError(f"{word} says no key: write key={word}, without spaces around =")
+    words = [word for word in arguments if not word.startswith("-") and "=" in word.lstrip("~+")]
+    for word in words:
+        if parse_override(word) is None:
+            key, _, value = word.partition("=")
+            quoted = shlex.quote(f'{key}="{value}"')
+            raise ConfigError(f"cannot read the override {word}; if its value is text, quote all of it: {quoted}")
+    return OverridesParser.create().parse_overrides(words)
 
 
 def check_overrides(config_name: str, arguments: list[str]) -> None:
@@ -119,12 +203,7 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
     Raises:
         ConfigError: see `load_config`.
     """
-    words = [word for word in arguments if not word.startswith("-") and "=" in word.lstrip("~+")]
-    try:
-        overrides = OverridesParser.create().parse_overrides(words)
-    except HydraException as error:
-        raise ConfigError(f"cannot read the overrides {' '.join(words)}: {str(error).splitlines()[0]}") from error
-    choices = [_choices(override) for override in overrides]
+    choices = [_choices(override) for override in _overrides(arguments)]
     groups = [alternatives for alternatives in choices if _is_group(alternatives[0])]
     configs = _compose_each(config_name, groups)
     for override in (choice for alternatives in choices for choice in alternatives):

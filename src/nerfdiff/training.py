@@ -12,12 +12,13 @@ from lightning import Trainer, seed_everything
 from omegaconf import DictConfig, OmegaConf
 
 from nerfdiff.callbacks.checkpoint import ClearCheckpointIO
-from nerfdiff.checkpoint import check_resumable, export_model, last_checkpoint, load_model
+from nerfdiff.checkpoint import check_resumable, export_model, load_model
 from nerfdiff.compilation import compile_unets
 from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.diffusion.layout import channels_last
 from nerfdiff.diffusion.unet import AUTO
 from nerfdiff.errors import CheckpointError, ConfigError
+from nerfdiff.inputs import last_checkpoint
 from nerfdiff.memory import WEIGHTS_ADAM_EMA, is_tight, within_memory
 from nerfdiff.modules.nerfdiff_module import NerfDiffModule
 from nerfdiff.results.hashes import sha256_file, sha256_values
@@ -65,7 +66,7 @@ def train(cfg: DictConfig) -> dict[str, float]:
     if trainer.is_global_zero:
         output_dir.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(cfg, output_dir / "config.yaml", resolve=True)
-    _announce(module, last)
+    _announce(module, last, trainer.strategy.root_device)
 
     trainer.fit(module, datamodule, ckpt_path=last, weights_only=True)
 
@@ -147,7 +148,7 @@ def _checkpoint_to_resume(output_dir: Path, cfg: DictConfig, model_config: dict)
     return last
 
 
-def _announce(module: NerfDiffModule, last: Path | None) -> None:
+def _announce(module: NerfDiffModule, last: Path | None, device: torch.device) -> None:
     counts = module.model.parameter_count()
     state = WEIGHTS_ADAM_EMA * counts["total"] / 2**30
     log.info(
@@ -157,4 +158,4 @@ def _announce(module: NerfDiffModule, last: Path | None) -> None:
         *(counts[part] / 1e6 for part in ("total", "encoder", "denoiser")),
         state,
     )
-    log.info("resuming from %s", last) if last else log.info("starting afresh")
+    log.info("%s on %s", f"resuming from {last}" if last else "starting afresh", device)

@@ -16,6 +16,7 @@ from nerfdiff.chart.payload import Measured, configuration_values, failure_value
 from nerfdiff.chart.pictures import small_sheets
 from nerfdiff.chart.png import write_png
 from nerfdiff.chart.published import published_for
+from nerfdiff.cli import command_words
 from nerfdiff.errors import ConfigError, DataError
 from nerfdiff.results.files import write_text
 from nerfdiff.results.frame import (
@@ -139,7 +140,7 @@ def _nothing(places: Sequence[Path], found: Found, configurations: int) -> str |
     where = " and ".join(map(str, places))
     if found.runs:
         return f"All {len(found.runs)} runs in {where} failed; why is below."
-    example = shlex.join(["python", "src/distill.py", "sweep=speed_accuracy", "ckpt=demo", "budget=minutes"])
+    example = shlex.join([*command_words("distill"), "sweep=speed_accuracy", "ckpt=demo", "budget=minutes"])
     return (
         f"There are no results in {where} yet: evaluations, distillations and sweeps leave a {RESULTS}, as in {example}"
     )

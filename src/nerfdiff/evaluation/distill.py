@@ -45,7 +45,7 @@ def distill(cfg: DictConfig) -> ResultRow | None:
     try:
         fabric = _launch(cfg)
         subject = picture_subject(cfg, fabric.device) if cfg.image else dataset_subject(cfg, fabric.device)
-        strategy, scorer = _strategy(cfg), instantiate(cfg.metrics)
+        strategy, scorer = _strategy(cfg), None if cfg.image else instantiate(cfg.metrics)
         _predict_together(fabric, subject, strategy)
         if fabric.global_rank > 0:
             return None

@@ -11,6 +11,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from nerfdiff.cli import command_words
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.distill.strategy import Strategy
 from nerfdiff.errors import ConfigError, TimeUp
@@ -87,8 +88,8 @@ def _asked_for(cfg: DictConfig) -> dict[str, Any]:
 
 
 def _command(hydra: DictConfig) -> str:
-    """The shell command that does what this job does, from the project's folder."""
-    words = ["python", f"src/{hydra.job.config_name}.py"]
+    """The shell command that does what this job does, from the project's folder or as installed."""
+    words = command_words(hydra.job.config_name)
     if any(word.startswith("sweep=") for word in hydra.overrides.task):
         words.append("hydra.mode=RUN")  # the settings of a sweep's jobs, and not the sweep again
     return shlex.join([*words, *hydra.overrides.task])

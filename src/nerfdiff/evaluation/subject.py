@@ -132,6 +132,7 @@ def picture_subject(cfg: DictConfig, device: torch.device) -> Subject:
     names = tuple(f"{view:03d}" for view in range(cameras.shape[1]))
     scene = replace(scene, target_cameras=cameras, target_pixels=blank, target_views=(names,))
     facts = {
+        "split_sha256": sha256_values(list(scene.scene_ids)),
         "files_sha256": [sha256_file(file) for file in (cfg.image, cfg.picture.mask) if file],
         "picture": plain(cfg.picture),
         "picture_views": plain(cfg.picture_views),

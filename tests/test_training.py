@@ -1,7 +1,5 @@
-import os
 import re
 import resource
-import signal
 import subprocess
 import time
 
@@ -12,7 +10,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import api_pb2, metadata
 
-from nerfdiff import training
 from nerfdiff.checkpoint import load_model
 from nerfdiff.errors import CheckpointError, ConfigError, DataError
 from training_fixtures import (
@@ -22,6 +19,7 @@ from training_fixtures import (
     last_checkpoint,
     run_command,
     run_training,
+    train_with,
     write_dataset,
 )
 
@@ -36,31 +34,6 @@ def whole(data, tmp_path_factory):
     """An uninterrupted run."""
     run = tmp_path_factory.mktemp("whole")
     return run, run_training(data, run)
-
-
-class StopAt(Callback):
-    """Sends this process SIGTERM at the end of a batch, as a scheduler would."""
-
-    def __init__(self, batch: int):
-        self.batch = batch
-
-    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
-        if batch_idx == self.batch:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-
-def train_with(monkeypatch, callback, data, run, *more):
-    """One run with one more callback, before the checkpoints'."""
-    build = training.instantiate
-
-    def instantiate(config, **options):
-        if "callbacks" in options:
-            options["callbacks"] = [callback, *options["callbacks"]]
-        return build(config, **options)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(training, "instantiate", instantiate)
-        return run_training(data, run, *more)
 
 
 def test_a_run_leaves_what_a_person_looks_for(whole):
@@ -110,19 +83,6 @@ def test_training_lowers_the_loss(data, tmp_path):
     longer = run_training(data, tmp_path / "b", "trainer.max_steps=40", "validation_every=40", "optimizer.lr=0.003")
     assert longer["val/psnr"] > short["val/psnr"] + 2
     assert longer["val/loss_dm"] < 0.9 * short["val/loss_dm"]
-
-
-@pytest.mark.parametrize(("accumulate", "batch"), [(1, 2), (2, 4), (2, 5)])
-def test_sigterm_then_the_same_command_ends_as_if_nothing_happened(data, tmp_path, monkeypatch, accumulate, batch):
-    """Stopped between steps (batch 5 of windows of two) and within one (batch 4)."""
-    more = f"trainer.accumulate_grad_batches={accumulate}"
-    run_training(data, tmp_path / "whole", more)
-    with pytest.raises(SystemExit):
-        train_with(monkeypatch, StopAt(batch), data, tmp_path / "stopped", more)
-    step = last_checkpoint(tmp_path / "stopped")["global_step"]
-    assert step == (batch + 1) // accumulate
-    run_training(data, tmp_path / "stopped", more)
-    assert_same_state(last_checkpoint(tmp_path / "whole"), last_checkpoint(tmp_path / "stopped"))
 
 
 def test_kill_9_then_the_same_command_ends_as_if_nothing_happened(data, tmp_path):

@@ -3,6 +3,7 @@
 import difflib
 import functools
 import os
+import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +21,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nerfdiff.cpu_memory import keep_freed_memory
 from nerfdiff.errors import ConfigError, UserError
+from nerfdiff.stopping import Stopped, leave, on_signals, stop
 
 CONF = Path(__file__).parents[2] / "conf"
 
@@ -73,7 +75,16 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], object]], 
             keep_freed_memory()
             command()
 
-        return main
+        @functools.wraps(function)
+        def stoppable() -> None:
+            words = shlex.join(["python", *sys.argv])
+            try:
+                with on_signals(stop):
+                    main()
+            except Stopped as stopped:
+                leave(stopped, words)
+
+        return stoppable
 
     return decorate
 

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from nerfdiff.errors import DataError
 from nerfdiff.metrics.image import quantise
-from nerfdiff.results.files import write_text
+from nerfdiff.results.files import publish, write_text
 
 FORMAT = 2
 PLAN = "plan.json"
@@ -77,10 +77,14 @@ class PredictionWriter:
         self.folder = Path(root) / _name(strategy)
         self.scenes = tuple(_name(scene) for scene in scenes)
         plan = {"format": FORMAT, "identity": json.loads(json.dumps(identity)), "scenes": list(self.scenes)}
-        if (self.folder / PLAN).exists():
+        if (self.folder / PLAN).exists() and not self._is_lost():
             self._check(plan)
         else:
             write_text(self.folder / PLAN, json.dumps(plan, indent=1) + "\n")
+
+    def _is_lost(self) -> bool:
+        """Whether a power cut left nothing of the plan, and nothing was made by it."""
+        return not (self.folder / PLAN).stat().st_size and not any(self.folder.glob(f"*/{SCENE}"))
 
     def _check(self, plan: dict[str, Any]) -> None:
         found = read_plan(self.folder)
@@ -159,7 +163,7 @@ class PredictionWriter:
             (partial / SCENE).write_text(json.dumps(facts, indent=1) + "\n")
             if final.exists():
                 shutil.rmtree(final)
-            partial.rename(final)
+            publish(partial, final)
         except OSError as error:
             raise DataError(
                 f"cannot write predictions to {final}: {error.strerror or error}; scenes before it are kept"

@@ -193,7 +193,7 @@ def test_a_run_does_not_go_on_with_other_data(data, run, tmp_path, caplog):
     assert (run / "config.yaml").read_bytes() == record and last_checkpoint(run)["global_step"] == 2
     run_training(other, run, "other_data=true", "trainer.max_steps=3")
     assert last_checkpoint(run)["global_step"] == 3
-    with pytest.raises(CheckpointError, match="trained on data.root="):
+    with pytest.raises(CheckpointError, match=r"trained on data\.root="):
         run_training(data, run)
 
 

@@ -29,7 +29,7 @@ class Stopped(BaseException):
 
     def __str__(self) -> str:
         by = "Ctrl-C" if self.signum == signal.SIGINT else signal.Signals(self.signum).name
-        return f"stopped by {by}. {self.kept or 'Nothing was begun.'}"
+        return f"stopped by {by}. {self.kept}".strip()
 
 
 @contextmanager

@@ -49,7 +49,7 @@ class TrainingProgress(ProgressBar):
                 self._said, self._said_at = step, now
         elif step - self._said >= self.every_steps or now - self._said_at >= self.every_seconds:
             rate = (step - self._first) / (now - self._began)
-            left = _duration((trainer.max_steps - step) / rate)
+            left = duration((trainer.max_steps - step) / rate)
             log.info("step %d of %d, %s, %.3g steps/s, %s left", step, trainer.max_steps, _words(trainer), rate, left)
             self._said, self._said_at = step, now
 
@@ -72,6 +72,7 @@ def _words(trainer: Trainer) -> str:
     return ", ".join(f"{name} {float(value):.3g}" for name, value in values.items() if value is not None)
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """A time as a person says it."""
     hours, minutes = divmod(round(seconds / 60), 60)
     return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min" if minutes else f"{seconds:.0f} s"

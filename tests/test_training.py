@@ -1,5 +1,6 @@
 import re
 import resource
+import signal
 import subprocess
 import time
 
@@ -129,8 +130,21 @@ def test_accumulated_batches_give_the_gradients_of_one(data, tmp_path, whole):
     assert differing(one, two) < 1e-3
 
 
-def test_two_processes_train_what_one_does(data, tmp_path, whole):
+def test_two_processes_train_what_one_does_also_when_they_are_stopped(data, tmp_path, whole):
+    """The scheduler's signal reaches the first of them, which has them all stop after the same step."""
     more = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "trainer.precision=32-true"]
+    progress = "{_target_: nerfdiff.callbacks.progress.TrainingProgress, every_steps: 1, every_seconds: 60}"
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": environment()}
+    process = subprocess.Popen(command(data, tmp_path, *more, f"callbacks.progress={progress}"), **pipes)
+    for line in process.stdout:
+        if "step 1 of 6, loss" in line:
+            process.send_signal(signal.SIGTERM)
+            break
+    _, said = process.communicate(timeout=300)
+    step = last_checkpoint(tmp_path)["global_step"]
+    assert process.returncode == 143 and 0 < step < 6, said
+    assert said.count("stopped by SIGTERM") == said.count(f"stopped by SIGTERM. Step {step} is saved in ") == 1
+    assert "Traceback" not in said
     run_command(data, tmp_path, *more)
     one, two = last_checkpoint(whole[0]), last_checkpoint(tmp_path)
     assert two["global_step"] == one["global_step"]

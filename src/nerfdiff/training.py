@@ -90,9 +90,9 @@ def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
     except TrainingDiverged as error:
         raise TrainingDiverged(f"{error}. {_sound(output_dir)}") from error
     except RuntimeError as error:
-        if trainer.world_size == 1 or not lost_process(error):
+        if trainer.world_size == 1 or not (sentence := lost_process(error)):
             raise
-        raise ProcessLost(f"{lost_process(error)} {describe(last_checkpoint(output_dir))}") from error
+        raise ProcessLost(f"{sentence} {describe(last_checkpoint(output_dir))} The same command goes on") from error
 
     if trainer.is_global_zero:
         # From the file, not the module: resuming a run that is complete leaves raw weights in the module.

@@ -1,5 +1,6 @@
 """From a file to a model: Lightning checkpoints and exported weights, always read as plain tensors."""
 
+import logging
 import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,13 +14,16 @@ from safetensors.torch import load_file, save_file
 
 from nerfdiff.errors import CheckpointError, ConfigError
 from nerfdiff.field.kinds import TRIPLANE
-from nerfdiff.inputs import WEIGHTS, find_weights
+from nerfdiff.inputs import LAST, PREVIOUS, WEIGHTS, find_weights
 from nerfdiff.model import NerfDiff
 from nerfdiff.results.files import atomic, write_text
 
 CONFIG = "model.yaml"
+DIVERGED, DAMAGED = "diverged.ckpt", "damaged.ckpt"
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 _PREFIX = "model."
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,8 @@ def load_model(ckpt: str | Path, weights: str, assets: str | Path | None = None)
     if weights not in ("ema", "raw"):
         raise CheckpointError(f"weights must be ema or raw, got {weights!r}")
     path = find_weights(ckpt, assets)
+    if Path(ckpt).is_dir() and path.name in (LAST, PREVIOUS):
+        path = last_checkpoint(ckpt)  # the last one that can be read
     read = _read_export if path.suffix == ".safetensors" else _read_ckpt
     config, image_size, stability, state = read(path, weights)
     return LoadedModel(_build(config, state, path), path, weights, config, image_size, stability)
@@ -186,3 +192,76 @@ def _build(config: Mapping, state: dict[str, torch.Tensor], path: Path) -> NerfD
     except (TypeError, KeyError, RuntimeError) as error:
         raise CheckpointError(f"{path} does not fit its own settings: {error}") from error
     return model.eval()
+
+
+def last_checkpoint(run: str | Path) -> Path:
+    """The checkpoint that a run resumes from: the last one that can be read; a line says if there is a later one.
+
+    Returns:
+        its path, or where the first will be.
+
+    Raises:
+        CheckpointError: there are checkpoints, but none that can be read.
+    """
+    folder = Path(run) / "checkpoints"
+    found = [path for path in (folder / LAST, folder / PREVIOUS) if path.is_file()]
+    for number, path in enumerate(found):
+        try:
+            read_checkpoint(path)
+        except CheckpointError as error:
+            if number + 1 == len(found):
+                raise
+            log.warning("%s; the one before it is taken, %s", error, found[number + 1])
+        else:
+            return path
+    return folder / LAST
+
+
+def describe(path: Path) -> str:
+    """A sentence on the checkpoint that a run resumes from, read to say it."""
+    if not path.is_file():
+        return "No checkpoint was saved yet."
+    return f"Step {read_checkpoint(path)['global_step']} is saved in {path}."
+
+
+def check_finite(path: Path) -> None:
+    """Read all weights of a checkpoint.
+
+    Raises:
+        CheckpointError: some are not finite.
+    """
+    checkpoint = read_checkpoint(path)
+    for name, value in (checkpoint["state_dict"] | checkpoint.get("current_model_state", {})).items():
+        if value.is_floating_point() and not value.isfinite().all():
+            raise CheckpointError(f"{path} holds weights that are not finite ({name})")
+
+
+def check_same_data(path: Path, now: Mapping[str, str]) -> None:
+    """Refuse to go on with other data than a run began with; files that were only moved are the same.
+
+    Args:
+        now: what `SceneDataModule.state_dict` says of the data.
+
+    Raises:
+        CheckpointError: naming both roots.
+    """
+    before = read_checkpoint(path).get("SceneDataModule")
+    if before is None:
+        log.warning("%s does not say what data it was trained on: whether that was %s is unchecked", path, now["root"])
+        return
+    if before == now:
+        return
+    moved = before["reader"].replace(before["root"], now["root"])
+    if before["files"] == now["files"] and moved == now["reader"]:
+        log.info("the data moved from %s to %s", before["root"], now["root"])
+        return
+    if before["root"] != now["root"]:
+        what = f"data.root={before['root']}, and data.root is {now['root']} now"
+    elif before["reader"] != now["reader"]:
+        what = f"data.root={now['root']} read as '{before['reader']}', and it is read as '{now['reader']}' now"
+    else:
+        what = f"data.root={now['root']}, and files there were added, removed or changed since"
+    raise CheckpointError(
+        f"the run of {path} was trained on {what}. Go on with the data it began with, choose another run_name to "
+        "start afresh, or say other_data=true to go on with the other data"
+    )

@@ -26,6 +26,7 @@ from nerfdiff.inputs import CHECKOUT, CONF, check_inputs
 from nerfdiff.noise import quieten
 from nerfdiff.quoting import parse_override, quote_values
 from nerfdiff.results.hashes import sha256_values
+from nerfdiff.stopping import Stopped, leave, on_signals, stop
 
 # What a value must be, by the type of its default.
 KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
@@ -91,7 +92,16 @@ def entry_point(config_name: str, *inputs: str) -> Callable[[Callable[[DictConfi
             keep_freed_memory()
             command()
 
-        return main
+        @functools.wraps(function)
+        def stoppable() -> None:
+            words = shlex.join([*command_words(config_name), *sys.argv[1:]])
+            try:
+                with on_signals(stop):
+                    main()
+            except Stopped as stopped:
+                leave(stopped, words)
+
+        return stoppable
 
     return decorate
 

@@ -23,6 +23,14 @@ class TrainingDiverged(UserError, RuntimeError):
     """Losses or gradients stayed non-finite for too many steps in a row."""
 
 
+class BusyError(UserError, RuntimeError):
+    """Another process works in the same folder."""
+
+
+class ProcessLost(UserError, RuntimeError):
+    """One of the processes that share a run died."""
+
+
 class TimeUp(UserError):
     """A run ended because the minutes it may take were spent, with work left to do."""
 

@@ -15,11 +15,12 @@ CHECKOUT = None if (PACKAGE / "conf").is_dir() else PACKAGE.parents[1]
 
 CONF, ASSETS = ((CHECKOUT or PACKAGE) / name for name in ("conf", "assets"))
 WEIGHTS = "model.safetensors"
+LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
 
 
-def last_checkpoint(run: str | Path) -> Path:
-    """Where a run keeps the checkpoint it resumes from."""
-    return Path(run) / "checkpoints" / "last.ckpt"
+def checkpoints(run: str | Path) -> list[Path]:
+    """Where a run keeps the checkpoint it resumes from, and the one before it."""
+    return [Path(run) / "checkpoints" / name for name in (LAST, PREVIOUS)]
 
 
 def find_weights(ckpt: str | Path, assets: str | Path | None) -> Path:
@@ -34,7 +35,7 @@ def find_weights(ckpt: str | Path, assets: str | Path | None) -> Path:
         CheckpointError: there is no such file.
     """
     assets = Path(assets or ASSETS)
-    candidates = [Path(ckpt), last_checkpoint(ckpt), Path(ckpt) / WEIGHTS, assets / ckpt / WEIGHTS]
+    candidates = [Path(ckpt), *checkpoints(ckpt), Path(ckpt) / WEIGHTS, assets / ckpt / WEIGHTS]
     path = next((candidate for candidate in candidates if candidate.is_file()), None)
     if path is None:
         shipped = sorted(file.parent.name for file in assets.glob(f"*/{WEIGHTS}"))

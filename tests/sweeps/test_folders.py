@@ -5,7 +5,7 @@ import pytest
 from hydra.core.hydra_config import HydraConfig
 
 from nerfdiff.cli import entry_point, job_folder, prepare_arguments
-from nerfdiff.inputs import find_weights, last_checkpoint
+from nerfdiff.inputs import checkpoints, find_weights
 from nerfdiff.quoting import parse_override
 
 
@@ -50,10 +50,10 @@ def test_swept_paths_become_names(folders, tmp_path):
     assert len(set(names)) == 3 and all(re.fullmatch(r"[\w.-]{9,109}", name, re.ASCII) for name in names)
     for name in names:
         run = tmp_path / "sweep" / name
-        last_checkpoint(run).parent.mkdir()
-        last_checkpoint(run).touch()
+        checkpoints(run)[0].parent.mkdir()
+        checkpoints(run)[0].touch()
         (word,) = prepare_arguments("export", ["ckpt"], [f"ckpt={run}", "out=x"])[:1]
-        assert find_weights(parse_override(word).value(), None) == last_checkpoint(run)
+        assert find_weights(parse_override(word).value(), None) == checkpoints(run)[0]
 
 
 @pytest.mark.parametrize("words", [["-m", "seed=3"], ["-m"]])

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from nerfdiff.data.draws import Draws, DrawSampler
 from nerfdiff.data.scene import MissingSplit, SceneReader
 from nerfdiff.data.views import EvaluationScenes, TrainingViews, spread
 from nerfdiff.errors import ConfigError
+from nerfdiff.stopping import ignore_signals
 
 log = logging.getLogger(__name__)
 
@@ -122,6 +124,15 @@ class SceneDataModule(LightningDataModule):
         self.val_set: EvaluationScenes | None = None
         self.test_set: EvaluationScenes | None = None
 
+    @cached_property
+    def _trained_on(self) -> dict[str, str]:
+        reader = self.reader("train")
+        return {"root": str(Path(self.root).resolve()), "reader": reader.identity, "files": reader.fingerprint()}
+
+    def state_dict(self) -> dict[str, str]:
+        """What a run is trained on, for its checkpoints: the reader's identity, and its files' fingerprint."""
+        return self._trained_on
+
     def reader(self, stage: str) -> SceneReader:
         """The reader of the files of the split that "train", "val" or "test" stands for.
 
@@ -225,7 +236,11 @@ class SceneDataModule(LightningDataModule):
 
 
 def _common_options() -> dict[str, Any]:
-    return {"collate_fn": ViewBatch.collate, "pin_memory": torch.cuda.is_available()}
+    return {
+        "collate_fn": ViewBatch.collate,
+        "pin_memory": torch.cuda.is_available(),
+        "worker_init_fn": ignore_signals,  # a step that is to be finished needs its data
+    }
 
 
 class TrainingLoader(DataLoader):

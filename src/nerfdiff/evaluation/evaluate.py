@@ -16,10 +16,11 @@ from nerfdiff.distill.strategy import Strategy
 from nerfdiff.evaluation.dashboard import show_in_dashboard
 from nerfdiff.evaluation.measure import measure, record_failure
 from nerfdiff.evaluation.pictures import sheet, video
-from nerfdiff.evaluation.predict import predict, require_all
+from nerfdiff.evaluation.predict import done, predict, require_all
 from nerfdiff.evaluation.subject import choose_device, dataset_subject
 from nerfdiff.results.row import ResultRow
 from nerfdiff.results.table import rich_table, write_markdown
+from nerfdiff.stopping import Stopped
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +51,8 @@ def evaluate(cfg: DictConfig) -> list[ResultRow]:
             predict(subject, strategy)
             require_all(subject, strategy)
             rows.append(measure(subject, strategy, scorer, reader))
+        except Stopped as stopped:
+            raise Stopped(stopped.signum, done(subject, strategy)) from None
         except Exception as error:
             record_failure(cfg, error, subject, strategy)
             raise

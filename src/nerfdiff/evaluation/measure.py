@@ -1,12 +1,15 @@
 """Predictions to a row of results."""
 
+import json
 import logging
 import os
 import shlex
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import filelock
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -29,7 +32,10 @@ log = logging.getLogger(__name__)
 
 
 def measure(subject: Subject, strategy: Strategy, scorer: Scorer, reader: SceneReader) -> ResultRow:
-    """Score the predictions of one strategy and append its row; one that has no model is timed by nothing."""
+    """Score the predictions of one strategy and append its row; one that has no model is timed by nothing.
+
+    Of several processes that made the scenes side by side, the first appends the row.
+    """
     scores = subject.folder / "scores" / strategy.name
     summary = scorer.score(subject.predictions / strategy.name, truth_from(reader), scores, subject.device)
     row = replace(_identified(subject, strategy), **summary, **cost_fields(subject, strategy))
@@ -37,8 +43,27 @@ def measure(subject: Subject, strategy: Strategy, scorer: Scorer, reader: SceneR
         log.warning("%s %s of %d", strategy.name, row.error, row.n_scenes)
         # where every scene fell back, the numbers are of the fields that distillation began with
         row = replace(row, status="diverged" if row.fallbacks == row.n_scenes else "ok")
-    append_row(subject.cfg.results, row)
+    with filelock.FileLock(subject.folder / ".row.lock"):
+        if _is_appended(subject, row):
+            log.info("another process, which made these scenes too, has appended the row of %s", row.run_id)
+        else:
+            append_row(subject.cfg.results, row)
     return row
+
+
+def _is_appended(subject: Subject, row: ResultRow) -> bool:
+    """Whether a row like this one was appended since this run began."""
+    results = Path(subject.cfg.results)
+    if not results.is_file():
+        return False
+    with open(results, "rb") as file:
+        file.seek(subject.rows_before)
+        for line in file:
+            with suppress(ValueError):
+                other = json.loads(line)
+                if isinstance(other, dict) and (other.get("run_id"), other.get("status")) == (row.run_id, row.status):
+                    return True
+    return False
 
 
 def record_failure(cfg: DictConfig, error: Exception, subject: Subject | None, strategy: Strategy | None) -> ResultRow:

@@ -36,6 +36,7 @@ class Subject:
         stability: of the model's training, see `LoadedModel`.
         conditions: a digest of what changes what scenes cost, and their numbers by rounding at most: hardware, threads,
             scenes at once, the renderer's chunks and the memory layout.
+        rows_before: bytes of the file of results before this run.
         data: where the scenes come from; None for a picture, whose other views nobody knows.
     """
 
@@ -49,6 +50,7 @@ class Subject:
     folder: Path
     stability: Mapping[str, float | int | None]
     conditions: str
+    rows_before: int
     data: SceneDataModule | None
 
     @property
@@ -188,4 +190,18 @@ def _subject(
     compile_unets(model, cfg.compile, cfg.paths.compiled_dir)
     spent_on = [hardware(device), cfg.threads, cfg.scenes_at_once, model.renderer.chunk, in_pixels]
     conditions = sha256_values(spent_on)[:8]
-    return Subject(cfg, model, load, scene_ids, device, precision, identity, folder, loaded.stability, conditions, data)
+    results = Path(cfg.results)
+    return Subject(
+        cfg=cfg,
+        model=model,
+        load=load,
+        scene_ids=scene_ids,
+        device=device,
+        precision=precision,
+        identity=identity,
+        folder=folder,
+        stability=loaded.stability,
+        conditions=conditions,
+        rows_before=results.stat().st_size if results.is_file() else 0,
+        data=data,
+    )

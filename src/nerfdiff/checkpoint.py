@@ -2,7 +2,7 @@
 
 import logging
 import pickle
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,14 @@ import yaml
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
+from nerfdiff.callbacks.snapshots import average_of
 from nerfdiff.errors import CheckpointError, ConfigError
 from nerfdiff.field.kinds import TRIPLANE
 from nerfdiff.inputs import LAST, PREVIOUS, WEIGHTS, find_weights
 from nerfdiff.model import NerfDiff
 from nerfdiff.results.files import atomic, write_text
 
-CONFIG = "model.yaml"
+CONFIG, SNAPSHOTS = "model.yaml", "snapshots"
 DIVERGED, DAMAGED = "diverged.ckpt", "damaged.ckpt"
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 _PREFIX = "model."
@@ -37,6 +38,7 @@ class LoadedModel:
         config: arguments of `NerfDiff`.
         image_size: (height, width) of the images it was trained on, if known.
         stability: of its training, under the names of `ResultRow`, where that was recorded.
+        trained_on: one entry for each training that led to it (`NerfDiffModule.trained_on`), where that was recorded.
     """
 
     model: NerfDiff
@@ -45,6 +47,17 @@ class LoadedModel:
     config: Mapping
     image_size: list[int] | None
     stability: Mapping[str, float | int | None]
+    trained_on: Sequence[Mapping[str, Any]] = ()
+
+    def describe(self) -> str:
+        """One line on what the model has seen."""
+        phases = [
+            f"{phase['images']:,} images for the {phase['part']} of {phase['scenes']} scenes of {phase['dataset']} "
+            f"({phase['about']})"
+            for phase in self.trained_on
+        ]
+        size = f", {self.image_size[0]}x{self.image_size[1]} pixels" if self.image_size else ""
+        return f"{self.path}{size}: trained on {', then '.join(phases) or 'what was not recorded'}"
 
 
 def load_model(ckpt: str | Path, weights: str, assets: str | Path | None = None) -> LoadedModel:
@@ -63,8 +76,9 @@ def load_model(ckpt: str | Path, weights: str, assets: str | Path | None = None)
     if Path(ckpt).is_dir() and path.name in (LAST, PREVIOUS):
         path = last_checkpoint(ckpt)  # the last one that can be read
     read = _read_export if path.suffix == ".safetensors" else _read_ckpt
-    config, image_size, stability, state = read(path, weights)
-    return LoadedModel(_build(config, state, path), path, weights, config, image_size, stability)
+    config, state, about = read(path, weights)
+    recorded = about.get("image_size"), about.get("stability") or {}, about.get("trained_on") or ()
+    return LoadedModel(_build(config, state, path), path, weights, config, *recorded)
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -98,20 +112,36 @@ def export_model(loaded: LoadedModel, folder: str | Path, dtype: torch.dtype) ->
         save_file(state, temporary)
     settings = {"weights": loaded.weights, "image_size": loaded.image_size, "model": dict(loaded.config)}
     settings |= {"stability": dict(loaded.stability)} if loaded.stability else {}
+    settings |= {"trained_on": [dict(phase) for phase in loaded.trained_on]} if loaded.trained_on else {}
     write_text(folder / CONFIG, yaml.safe_dump(settings, sort_keys=False))
     return folder / WEIGHTS
 
 
-def export(ckpt: str, weights: str, out: str | Path, dtype: str, assets: str | Path | None) -> Path:
+def export(
+    ckpt: str,
+    weights: str,
+    out: str | Path,
+    dtype: str,
+    assets: str | Path | None,
+    average: float | None = None,
+    step: int | None = None,
+) -> Path:
     """`load_model`, then `export_model`; returns the file.
 
+    Args:
+        average: instead of the EMA, the average of this length σ_rel from the run's snapshots (`average_of`).
+        step: up to which it goes; None: the last snapshot.
+
     Raises:
-        CheckpointError: see `load_model`.
+        CheckpointError: see `load_model` and `average_of`.
         ConfigError: `dtype` is not a floating-point type to store weights in.
     """
     if dtype not in DTYPES:
         raise ConfigError(f"dtype must be one of {', '.join(DTYPES)}, got {dtype!r}")
-    return export_model(load_model(ckpt, weights, assets), out, DTYPES[dtype])
+    loaded = load_model(ckpt, weights, assets)
+    if average is not None:
+        loaded.model.load_state_dict(average_of(Path(ckpt) / SNAPSHOTS, average, step), strict=False)
+    return export_model(loaded, out, DTYPES[dtype])
 
 
 def differences(old: Mapping, new: Mapping, prefix: str = "") -> list[str]:
@@ -154,7 +184,8 @@ def check_resumable(path: str | Path, model_config: Mapping, accumulate: int) ->
         )
 
 
-Read = tuple[Mapping, list[int] | None, Mapping[str, float | int | None], dict[str, torch.Tensor]]
+Read = tuple[Mapping, dict[str, torch.Tensor], Mapping[str, Any]]
+"""Settings and weights of a model, and what else is recorded of it."""
 
 
 def _read_ckpt(path: Path, weights: str) -> Read:
@@ -164,14 +195,13 @@ def _read_ckpt(path: Path, weights: str) -> Read:
         raise CheckpointError(f"{path} holds no averaged weights (no EMA callback in that run): use weights=raw")
     state = checkpoint["current_model_state" if weights == "raw" and averaged else "state_dict"]
     state = {name.removeprefix(_PREFIX): value for name, value in state.items() if name.startswith(_PREFIX)}
-    stability = checkpoint.get("stability", {})
-    return checkpoint["hyper_parameters"]["model"], checkpoint.get("image_size"), stability, state
+    return checkpoint["hyper_parameters"]["model"], state, checkpoint
 
 
 def _read_export(path: Path, weights: str) -> Read:
     try:
         settings = yaml.safe_load(path.with_name(CONFIG).read_text())
-        stored, image_size, config = settings["weights"], settings["image_size"], settings["model"]
+        stored, config = settings["weights"], settings["model"]
     except (OSError, yaml.YAMLError, KeyError, TypeError) as error:
         raise CheckpointError(
             f"{path.with_name(CONFIG)} cannot be read ({error!r}); it holds the sizes that {path.name} was trained with"
@@ -182,7 +212,7 @@ def _read_export(path: Path, weights: str) -> Read:
         state = load_file(path)
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{path} is not a readable safetensors file ({error})") from error
-    return config, image_size, settings.get("stability", {}), state
+    return config, state, settings
 
 
 def _build(config: Mapping, state: dict[str, torch.Tensor], path: Path) -> NerfDiff:

@@ -80,7 +80,9 @@ def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
         kept_renderings=_kept_renderings(cfg, datamodule),
     )
     if cfg.init is not None and last is None:
-        module.model.load_state_dict(load_model(cfg.init, "ema", cfg.paths.assets_dir).model.state_dict())
+        begun = load_model(cfg.init, "ema", cfg.paths.assets_dir)
+        module.model.load_state_dict(begun.model.state_dict())
+        module.trained_before = list(begun.trained_on)
     module.model.renderer = replace(module.model.renderer, backend=cfg.backend, kernel_precision=cfg.kernel_precision)
     compile_unets(module.model, cfg.compile, cfg.paths.compiled_dir)
     _announce(module, last, trainer.strategy.root_device)

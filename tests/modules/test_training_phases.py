@@ -146,13 +146,14 @@ def test_losses_that_cannot_be(losses, message):
 
 def test_two_phases_as_a_person_runs_them(data, tmp_path):
     field = tmp_path / "field"
-    run_training(data, field, *FIELD)
+    run_training(data, field, *FIELD, "data.about=tests")
     more = [
         "losses.lambda_ic=0",
         f"init={field}",
         f"kept_renderings={tmp_path / 'kept'}",
         "data.train_source_views=1",
         "optimizer.decay=none",
+        "data.about=tests",
     ]
     run_training(data, tmp_path / "cdm", *more)
     before, after = (load_model(run, "raw", "assets").model.state_dict() for run in (field, tmp_path / "cdm"))
@@ -166,6 +167,16 @@ def test_two_phases_as_a_person_runs_them(data, tmp_path):
     with sqlite3.connect(kept) as file:
         names = [name for (name,) in file.execute("SELECT name FROM renderings")]
     assert names and all(name.split("/")[1] == "000000" for name in names)  # one source view of each scene
+
+    # what it was trained on goes with it
+    phases = load_model(tmp_path / "cdm" / "model", "ema").trained_on
+    assert [(p["part"], p["images"], p["scenes"], p["about"]) for p in phases] == [
+        ("field", 24, 3, "tests"), ("CDM", 24, 3, "tests")
+    ]  # fmt: skip
+    assert (
+        "24 images for the field of 3 scenes of srn_cars (tests), then 24 images for the CDM"
+        in load_model(tmp_path / "cdm", "ema").describe()
+    )
 
     # stopped and resumed: the same bits, whatever is kept already
     half = tmp_path / "half"

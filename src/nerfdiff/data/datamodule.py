@@ -52,6 +52,7 @@ class SceneDataModule(LightningDataModule):
         num_workers: processes that load training and test batches.
         cache, cache_dir: whether training images are decoded once into one file, and where.
         seed: of the draws.
+        about: words on the data for whoever uses a model trained on it, as the elevations its cameras have.
         train_split, val_split, test_split: names of the dataset's splits. Where the one for validation is
             not there, training goes on without validation.
 
@@ -83,6 +84,7 @@ class SceneDataModule(LightningDataModule):
         cache: bool,
         cache_dir: str | Path,
         seed: int,
+        about: str,
         train_split: str = "train",
         val_split: str = "val",
         test_split: str = "test",
@@ -119,6 +121,7 @@ class SceneDataModule(LightningDataModule):
         self.val_source_view, self.val_scenes, self.val_targets = val_source_view, val_scenes, val_targets
         self.source_view, self.eval_scenes, self.eval_stride = source_view, eval_scenes, eval_stride
         self.cache, self.cache_dir = cache, cache_dir
+        self.about = about
         self.splits = {"train": train_split, "val": val_split, "test": test_split}
         self.train_reader: SceneReader | None = None
         self.val_set: EvaluationScenes | None = None
@@ -140,6 +143,11 @@ class SceneDataModule(LightningDataModule):
             MissingSplit, DataError: as the reader's.
         """
         return self.make_reader(root=self.root, split=self.splits[stage], image_size=self.image_size)
+
+    @property
+    def trained_scenes(self) -> int:
+        """How many scenes a run draws from."""
+        return len(spread(len(self.train_reader), self.train_scenes))
 
     def setup(self, stage: str) -> None:
         if stage == "fit":

@@ -1,5 +1,6 @@
 """What is evaluated on what: a model, scenes, and all that predictions of one run share."""
 
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
@@ -20,6 +21,8 @@ from nerfdiff.model import NerfDiff
 from nerfdiff.results.environment import hardware
 from nerfdiff.results.hashes import sha256_file, sha256_values
 from nerfdiff.training import auto_precision, plain
+
+log = logging.getLogger(__name__)
 
 PRECISIONS = ("32-true", "bf16-mixed")
 
@@ -90,6 +93,7 @@ def dataset_subject(cfg: DictConfig, device: torch.device) -> Subject:
         UserError: bad data, config or checkpoint.
     """
     loaded = load_model(cfg.ckpt, cfg.weights, cfg.paths.assets_dir)
+    log.info("ckpt=%s", loaded.describe())
     datamodule = instantiate(cfg.data)
     datamodule.setup("test")
     reader = datamodule.reader("test")
@@ -124,6 +128,7 @@ def picture_subject(cfg: DictConfig, device: torch.device) -> Subject:
         UserError: bad picture, config or checkpoint.
     """
     loaded = load_model(cfg.ckpt, cfg.weights, cfg.paths.assets_dir)
+    log.info("ckpt=%s", loaded.describe())
     size = loaded.image_size or plain(cfg.picture_size)
     if size is None:
         raise ConfigError(f"{loaded.path} does not say what image size it is for: give picture_size=[height,width]")

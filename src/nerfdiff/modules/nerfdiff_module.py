@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -23,6 +24,7 @@ from nerfdiff.metrics.image import psnr, psnr_of_mse
 from nerfdiff.model import NerfDiff
 from nerfdiff.modules.kept_renderings import KeptRenderings
 from nerfdiff.randomness import generator, spread_times
+from nerfdiff.results.environment import git_state
 
 WHOLE = {"ray_share": 1.0, "through_rendering": True, "weighting": "v"}
 """The paper's joint loss, which checkpoints from before there was another have."""
@@ -73,6 +75,7 @@ class NerfDiffModule(LightningModule):
         if losses["lambda_dm"] == 0:
             self.model.denoiser.requires_grad_(False)
         self.image_size: list[int] | None = None  # of the training images, once one was seen
+        self.trained_before: list[dict[str, Any]] = []  # what `init` was trained on
         if channels_last:
             self.model.to(memory_format=torch.channels_last)
 
@@ -148,6 +151,24 @@ class NerfDiffModule(LightningModule):
         """What a person has to keep the same to resume, or to use the model well."""
         checkpoint["accumulate_grad_batches"] = self.trainer.accumulate_grad_batches
         checkpoint["image_size"] = self.image_size
+        checkpoint["trained_on"] = self.trained_on()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.trained_before = list(checkpoint.get("trained_on", [{}])[:-1])
+
+    def trained_on(self) -> list[dict[str, Any]]:
+        """What the weights have seen: one entry for each training that led here, this one last."""
+        data, losses = self.trainer.datamodule, self.hparams.losses
+        part = "field" if losses["lambda_dm"] == 0 else "CDM" if losses["lambda_ic"] == 0 else "field and the CDM"
+        seen = {
+            "part": part,
+            "images": self.trainer.global_step * data.batch_size * data.target_views,
+            "dataset": data.name,
+            "scenes": data.trained_scenes,
+            "about": data.about,
+            "git_sha": git_state(Path(__file__).parent)["git_sha"],
+        }
+        return [*self.trained_before, seen]
 
     def _photometric(
         self, batch: ViewBatch, encoding: Encoding, noise: dict[str, Tensor], losses: Mapping

@@ -376,7 +376,7 @@ def test_a_process_that_dies_ends_the_run_with_a_sentence(data, run, tmp_path):
             other.kill()
             break
     _, said = process.communicate(timeout=300)
-    assert process.returncode == 1 and "Traceback" not in said and "gloo" not in said, said
+    assert process.returncode == 1 and "Traceback" not in said, said
     sentence = "Process 1 of 2 was ended by SIGKILL. 1 of 2 scenes of ngd are saved in "
     assert said.strip().splitlines()[-1].startswith(f"error: {sentence}")
     (row,) = read_rows(out / "results.jsonl")

@@ -13,6 +13,8 @@ from nerfdiff.quoting import parse_override
 def folders(tmp_path, monkeypatch):
     """Runs a sweep of jobs that do nothing; the names of their folders by the jobs' overrides."""
 
+    monkeypatch.setattr("nerfdiff.cli.quieten", lambda: None)  # the loggers are those of all tests
+
     def sweep(command: str, *words: str) -> dict[str, str]:
         found = {}
 

@@ -67,7 +67,7 @@ def test_the_papers_numbers():
         ("optimizer=1", ["optimizer takes paper or small, got 1"]),
         ("model.unet.channel_mult=3", ["model.unet.channel_mult takes a list (default [1, 1, 2, 3, 4]), got 3"]),
         ("model.unet.channel_mult=[1,2],3", ["takes a list", "got 3"]),
-        ("model.unet=wide", ["model.unet takes a mapping (keys width, channel_mult", "'wide'"]),
+        ("model.unet=wide", ["model.unet takes a mapping (keys width, patch, channel_mult", "'wide'"]),
         ("trainer.max_steps=[10]", ["takes int"]),
     ],
 )

@@ -142,7 +142,7 @@ def test_a_signal_that_is_ignored_stays_so():
 
 
 def wait_for_log(run, words: str, process) -> None:
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 300
     while time.monotonic() < deadline and process.poll() is None:
         if any(words in path.read_text() for path in run.glob("*.log")):
             return
@@ -176,7 +176,7 @@ def test_ctrl_c_reaches_a_run_and_its_workers(data, tmp_path):
     )
     wait_for_log(run, "step 2 of 2000", process)
     os.killpg(process.pid, signal.SIGINT)
-    _, said = process.communicate(timeout=60)
+    _, said = process.communicate(timeout=300)
     assert process.returncode == 130, said
     step = last_checkpoint(run)["global_step"]
     last = said.strip().splitlines()[-1]
@@ -237,7 +237,6 @@ def diverge(monkeypatch, at: int, factor: float = float("nan")) -> None:
 EVERY_STEP = [
     "callbacks.last.every_n_steps=1",
     "callbacks.nonfinite.patience=3",
-    "validation_every=1",
     "optimizer.decay=none",
 ]
 
@@ -246,7 +245,7 @@ def test_a_diverging_run_keeps_the_checkpoint_from_before(data, run, monkeypatch
     """Steps 3 and 4 are good. 4's weights are the ones that no good step followed."""
     diverge(monkeypatch, at=4)
     with pytest.raises(TrainingDiverged, match=r"3 steps in a row.* Step 3 is saved in .*last\.ckpt"):
-        run_training(data, run, *EVERY_STEP, "trainer.max_steps=20")
+        run_training(data, run, *EVERY_STEP, "validation_every=2", "trainer.max_steps=20")
     assert last_checkpoint(run)["global_step"] == 3
     folder = run / "checkpoints"
     assert torch.load(folder / "diverged.ckpt", weights_only=True)["global_step"] == 4

@@ -2,8 +2,12 @@
 
 import logging
 import pickle
+import re
+import zipfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +20,9 @@ from nerfdiff.callbacks.snapshots import average_of
 from nerfdiff.errors import CheckpointError, ConfigError
 from nerfdiff.field.kinds import TRIPLANE
 from nerfdiff.inputs import LAST, PREVIOUS, WEIGHTS, find_weights
-from nerfdiff.model import NerfDiff
+from nerfdiff.model import NerfDiff, build_on_meta
 from nerfdiff.results.files import atomic, write_text
+from nerfdiff.results.hashes import sha256_file
 
 CONFIG, SNAPSHOTS = "model.yaml", "snapshots"
 DIVERGED, DAMAGED = "diverged.ckpt", "damaged.ckpt"
@@ -82,22 +87,101 @@ def load_model(ckpt: str | Path, weights: str, assets: str | Path | None = None)
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """A Lightning checkpoint as plain data.
+    """A Lightning checkpoint as plain data, every byte of it checked.
 
     Raises:
-        CheckpointError: the file is missing, damaged, or no checkpoint of this project.
+        CheckpointError: the file is missing, damaged, or no checkpoint of this project; the message says which one
+            beside it can be read instead.
     """
     try:
+        return _read(Path(path))
+    except CheckpointError as error:
+        raise CheckpointError(f"{error}. {_instead(Path(path))}") from error
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        found = path.stat()
+        _check_bytes(path, found.st_mtime_ns, found.st_size)
         checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except FileNotFoundError as error:
         raise CheckpointError(f"checkpoint {path} does not exist") from error
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+    except pickle.UnpicklingError as error:
+        found = re.search(r"GLOBAL ([\w.]+)", str(error))
+        what = f"{found[1]}, which could run anything" if found else "something else than tensors and settings"
+        raise CheckpointError(f"{path} holds {what}, and was not loaded") from error
+    except Exception as error:  # damaged bytes surface as whatever zipfile, pickle or PyTorch trips over
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(f"{path} is not a readable checkpoint ({reason})") from error
-    parameters = checkpoint.get("hyper_parameters", {}) if isinstance(checkpoint, dict) else {}
-    if "model" not in parameters or "state_dict" not in checkpoint:
-        raise CheckpointError(f"{path} is not a checkpoint of NerfDiffModule: it holds no model settings")
+    if wrong := _unexpected(checkpoint):
+        raise CheckpointError(f"{path} is not a checkpoint of NerfDiffModule: {wrong}")
     return checkpoint
+
+
+@lru_cache(maxsize=16)
+def _check_bytes(path: Path, changed: int, size: int) -> None:
+    """Compare all bytes of a checkpoint with their CRCs, once per file: PyTorch does not.
+
+    Raises:
+        ValueError: it is damaged, or was packed anew.
+        OSError, zipfile.BadZipFile: it cannot be read.
+    """
+    with zipfile.ZipFile(path) as archive:
+        for entry in archive.infolist():
+            if entry.compress_type != zipfile.ZIP_STORED:  # PyTorch would take compressed bytes for weights
+                raise ValueError(f"{entry.filename} in it is compressed, which PyTorch's are not")
+        if damaged := archive.testzip():
+            raise ValueError(f"bytes of {damaged} in it changed since they were written")
+
+
+def _unexpected(checkpoint: Any) -> str | None:
+    """What is not as `NerfDiffModule` saves it, if anything."""
+
+    def tensors(value: Any) -> bool:
+        return isinstance(value, Mapping) and all(isinstance(part, torch.Tensor) for part in value.values())
+
+    if not isinstance(checkpoint, dict):
+        return f"it holds a {type(checkpoint).__name__}"
+    settings = checkpoint.get("hyper_parameters")
+    model = settings.get("model") if isinstance(settings, Mapping) else None
+    if not isinstance(model, Mapping) or not all(isinstance(model.get(k), Mapping) for k in ("unet", "field")):
+        return "it holds no model settings"
+    for key, needed, possible, expected in (
+        ("state_dict", True, tensors, "tensors by name"),
+        ("current_model_state", False, tensors, "tensors by name"),
+        ("global_step", True, lambda value: isinstance(value, int) and value >= 0, "a number of steps"),
+        ("image_size", False, lambda value: value is None or _is_size(value), "[height, width]"),
+        ("stability", False, lambda value: isinstance(value, Mapping), "numbers by name"),
+        ("SceneDataModule", False, _is_text_by_name, "what it was trained on"),
+    ):
+        if (needed or key in checkpoint) and not possible(checkpoint.get(key)):
+            return f"expected {expected} as its {key}, found a {type(checkpoint.get(key)).__name__}"
+    return None
+
+
+def _is_size(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(type(side) is int and side > 0 for side in value)
+
+
+def _is_text_by_name(value: Any) -> bool:
+    keys = ("root", "reader", "files")
+    return isinstance(value, Mapping) and all(isinstance(value.get(key), str) for key in keys)
+
+
+def _instead(path: Path) -> str:
+    """What to do where a checkpoint cannot be read: the one beside it that was trained longest can perhaps."""
+    steps = {}
+    for other in path.parent.glob("*.ckpt") if path.parent.is_dir() else ():
+        if other.name not in (path.name, DIVERGED, DAMAGED) and other.is_file():
+            with suppress(CheckpointError):
+                steps[other] = _read(other)["global_step"]
+    if not steps:
+        return "Give another checkpoint, or delete it to start afresh"
+    best = max(steps, key=steps.get)
+    return (
+        f"{best} beside it can be read, of step {steps[best]}: say ckpt={best}; to train on from there, copy it to "
+        f"{path.parent / LAST}"
+    )
 
 
 def export_model(loaded: LoadedModel, folder: str | Path, dtype: torch.dtype) -> Path:
@@ -105,12 +189,27 @@ def export_model(loaded: LoadedModel, folder: str | Path, dtype: torch.dtype) ->
 
     Args:
         dtype: of the stored weights.
+
+    Raises:
+        CheckpointError: weights are not finite, or beyond what `dtype` holds; nothing is written.
     """
     folder = Path(folder)
     state = {name: value.to("cpu", dtype).contiguous() for name, value in loaded.model.state_dict().items()}
+    for name, value in loaded.model.state_dict().items():
+        if not value.isfinite().all():
+            raise CheckpointError(
+                f"{loaded.path} holds weights that are not finite ({name}), and is not exported: its training "
+                "diverged. Give an earlier checkpoint"
+            )
+        if not state[name].isfinite().all():
+            raise CheckpointError(
+                f"{loaded.path} holds weights of {value.abs().max():.3g} ({name}), and {dtype} only holds "
+                f"{torch.finfo(dtype).max:.3g}: choose dtype=bfloat16 or float32"
+            )
     with atomic(folder / WEIGHTS) as temporary:
         save_file(state, temporary)
     settings = {"weights": loaded.weights, "image_size": loaded.image_size, "model": dict(loaded.config)}
+    settings["sha256"] = sha256_file(folder / WEIGHTS)
     settings |= {"stability": dict(loaded.stability)} if loaded.stability else {}
     settings |= {"trained_on": [dict(phase) for phase in loaded.trained_on]} if loaded.trained_on else {}
     write_text(folder / CONFIG, yaml.safe_dump(settings, sort_keys=False))
@@ -202,7 +301,12 @@ def _read_export(path: Path, weights: str) -> Read:
     try:
         settings = yaml.safe_load(path.with_name(CONFIG).read_text())
         stored, config = settings["weights"], settings["model"]
-    except (OSError, yaml.YAMLError, KeyError, TypeError) as error:
+        image_size, digest = settings["image_size"], settings.get("sha256")
+        if not isinstance(config, Mapping) or not isinstance(settings.get("stability", {}), Mapping):
+            raise TypeError("expected settings by name as its model")
+        if image_size is not None and not _is_size(image_size):
+            raise TypeError(f"expected [height, width] as its image_size, found {image_size!r}")
+    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise CheckpointError(
             f"{path.with_name(CONFIG)} cannot be read ({error!r}); it holds the sizes that {path.name} was trained with"
         ) from error
@@ -212,14 +316,25 @@ def _read_export(path: Path, weights: str) -> Read:
         state = load_file(path)
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{path} is not a readable safetensors file ({error})") from error
+    if digest is not None and digest != sha256_file(path):  # exports from before have none
+        raise CheckpointError(
+            f"{path} is not the file that {path.with_name(CONFIG)} was written for (its SHA-256 is another): one of "
+            "the two is damaged or was exchanged. Export or copy both anew"
+        )
     return config, state, settings
 
 
 def _build(config: Mapping, state: dict[str, torch.Tensor], path: Path) -> NerfDiff:
     try:
+        expected = {name: value.shape for name, value in build_on_meta(config).state_dict().items()}
+        found = {name: value.shape for name, value in state.items()}
+        if wrong := [name for name in expected | found if expected.get(name) != found.get(name)]:
+            raise ValueError(
+                f"{len(wrong)} weights, as {wrong[0]}: {found.get(wrong[0])}, expected {expected.get(wrong[0])}"
+            )
         model = NerfDiff(**config)
         model.load_state_dict({name: value.float() for name, value in state.items()})
-    except (TypeError, KeyError, RuntimeError) as error:
+    except Exception as error:  # settings of any kind surface as whatever a module trips over
         raise CheckpointError(f"{path} does not fit its own settings: {error}") from error
     return model.eval()
 
@@ -236,14 +351,14 @@ def last_checkpoint(run: str | Path) -> Path:
     folder = Path(run) / "checkpoints"
     found = [path for path in (folder / LAST, folder / PREVIOUS) if path.is_file()]
     for number, path in enumerate(found):
-        try:
+        if number + 1 == len(found):
             read_checkpoint(path)
-        except CheckpointError as error:
-            if number + 1 == len(found):
-                raise
-            log.warning("%s; the one before it is taken, %s", error, found[number + 1])
-        else:
             return path
+        try:
+            _read(path)
+            return path
+        except CheckpointError as error:
+            log.warning("%s; the one before it is taken, %s", error, found[number + 1])
     return folder / LAST
 
 

@@ -21,8 +21,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nerfdiff.cpu_memory import keep_freed_memory
-from nerfdiff.errors import ConfigError, UserError
-from nerfdiff.inputs import CHECKOUT, CONF, check_inputs
+from nerfdiff.errors import ConfigError, UserError, is_out_of_memory
+from nerfdiff.inputs import CHECKOUT, CONF, check_inputs, check_output
+from nerfdiff.limits import check_limit, check_limits
 from nerfdiff.noise import quieten
 from nerfdiff.quoting import parse_override, quote_values
 from nerfdiff.results.hashes import sha256_values
@@ -73,7 +74,7 @@ def entry_point(config_name: str, *inputs: str) -> Callable[[Callable[[DictConfi
             try:
                 return function(cfg)
             except Exception as error:
-                message = explain(error)
+                message = explain(error, cfg)
                 if message is None or os.environ.get("HYDRA_FULL_ERROR") == "1":
                     raise
                 if HydraConfig.get().mode == RunMode.MULTIRUN:
@@ -125,12 +126,17 @@ def job_folder(swept: str, overrides: Sequence[str] = ()) -> str:
 OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
 
 
-def explain(error: BaseException) -> str | None:
-    """The line that tells a person what to mend; None for errors that are no `UserError` and not of the config.
+def explain(error: BaseException, cfg: DictConfig | None = None) -> str | None:
+    """The line that tells a person what to mend; None for errors that nobody but a developer can mend.
 
     Finds a `UserError` behind Hydra's `instantiate` and behind the traceback with which PyTorch's DataLoader hands
-    on what a worker raised.
+    on what a worker raised. Files and memory that the system refuses are a person's to mend, too.
+
+    Args:
+        cfg: of the command, of which memory's advice names the keys.
     """
+    if not isinstance(error, UserError) and (refused := _refused(error, cfg)):
+        return refused
     if not isinstance(error, (UserError, InstantiationException, OmegaConfBaseException)):
         return None
     chain = [error]
@@ -150,15 +156,37 @@ def explain(error: BaseException) -> str | None:
     return _one_line(f"{key}: " if key else "", target, cause)
 
 
+def _refused(error: BaseException, cfg: DictConfig | None) -> str | None:
+    """What the system would not give: a file, or memory."""
+    if is_out_of_memory(error):
+        known = ("data.batch_size", "budget.rays", "budget.views", "strategy.views_at_once", "scenes_at_once", "chunk")
+        keys = [key for key in known if cfg is not None and OmegaConf.select(cfg, key, default=None) is not None]
+        lower = f": lower {', '.join(keys)}" if keys else ""
+        return _one_line("memory ran out", f"({str(error).splitlines()[0][:200]})" if str(error) else "") + lower
+    if isinstance(error, OSError):
+        what = error.strerror or _last_line(error) or type(error).__name__
+        return _one_line(f"{error.filename}: " if error.filename else "", what)
+    if isinstance(error, RuntimeError) and "Symlink loop" in str(error):  # pathlib's
+        return _last_line(error)
+    return None
+
+
+def _last_line(error: BaseException) -> str:
+    """Of what it says: where a DataLoader's worker raised it, the lines before are a traceback."""
+    return (str(error).strip().splitlines() or [""])[-1]
+
+
 def load_config(config_name: str, overrides: list[str]) -> DictConfig:
     """The composed config of an entry point, as its command would see it (without Hydra's own node).
 
     Raises:
-        ConfigError: an override names no key, or its value is of the wrong kind.
+        ConfigError: an override names no key, or its value is of the wrong kind, or a number that no run can have.
     """
     overrides = quote_values(overrides)
     check_overrides(config_name, overrides)
-    return _compose(config_name, overrides)
+    config = _compose(config_name, overrides)
+    check_limits(config)
+    return config
 
 
 def prepare_arguments(config_name: str, inputs: Sequence[str], arguments: list[str]) -> list[str]:
@@ -181,7 +209,9 @@ def prepare_arguments(config_name: str, inputs: Sequence[str], arguments: list[s
     words += [override.input_line for override in fixed.values() if not _is_group(override)]
     config = _compose(config_name, words, with_hydra=True)
     if options.isdisjoint(MULTIRUN) and config.hydra.mode != RunMode.MULTIRUN:
+        check_limits(config)
         check_inputs(config, inputs)
+        check_output(config)
         return arguments
     check_inputs(config, inputs, swept=swept | set(config.hydra.sweeper.get("params") or ()), only=fixed)
     # jobs, in whatever process, are to name their folders by what is swept
@@ -306,6 +336,8 @@ def _check_kind(default: object, override: Override) -> None:
     """A number stays a number and a list a list; null, strings and interpolations say nothing of their kind."""
     value = override.value()
     interpolated = isinstance(value, str) and "${" in value
+    if not isinstance(value, str):
+        check_limit(override.key_or_group, value)
     if type(default) not in KINDS or value is None or interpolated or override.is_sweep_override():
         return
     if isinstance(value, EITHER.get(override.key_or_group.rpartition(".")[2], ())):

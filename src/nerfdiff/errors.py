@@ -31,8 +31,29 @@ class ProcessLost(UserError, RuntimeError):
     """One of the processes that share a run died."""
 
 
+class OutOfMemory(UserError, MemoryError):
+    """What was asked for takes more memory than the device has free."""
+
+
 class TimeUp(UserError):
     """A run ended because the minutes it may take were spent, with work left to do."""
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether a device's memory ran out; PyTorch says so of a CPU's in words only."""
+    words = "can't allocate memory", "not enough memory", "CUDA out of memory"
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(w in str(error) for w in words))
+
+
+def size_text(count: float) -> str:
+    """Bytes as a person reads them: `512 bytes`, `3.4 MB`."""
+    for unit in ("bytes", "kB", "MB", "GB"):
+        if count < 1000:
+            break
+        count /= 1000
+    else:
+        unit = "TB"
+    return f"{count:.0f} {unit}" if unit == "bytes" else f"{count:.3g} {unit}" if count < 1000 else f"{count:.0f} {unit}"
 
 
 def some(names: Collection[str], limit: int = 8) -> str:

@@ -1,5 +1,6 @@
 """Files and folders that commands read, looked for without importing anything slow."""
 
+import os
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -74,8 +75,29 @@ def check_inputs(
                 if not Path(place).exists():
                     raise DataError(f"results={place}: no such file or folder; name folders of runs, or their files")
         elif not Path(value).is_file():
-            what = "is a folder" if Path(value).is_dir() else "no such file"
+            what = "no such file"
+            if Path(value).exists():
+                what = "is a folder" if Path(value).is_dir() else "is no ordinary file"
             raise DataError(f"{key}={value}: {what}; name a picture")
+
+
+def check_output(cfg: DictConfig) -> None:
+    """Refuse a composed config, Hydra's node included, whose run folder cannot be written.
+
+    Raises:
+        DataError: naming the folder, and why.
+    """
+    if cfg.hydra.output_subdir is None:
+        return
+    folder = Path(str(cfg.hydra.run.dir)).absolute()
+    there = next(parent for parent in (folder, *folder.parents) if os.path.lexists(parent))
+    if not there.is_dir():
+        why = f"{there} is a link that leads nowhere" if there.is_symlink() else f"{there} is no folder"
+    elif not os.access(there, os.W_OK | os.X_OK):
+        why = f"{there} cannot be written"
+    else:
+        return
+    raise DataError(f"the run's folder {folder}: {why}; choose another paths.runs_dir or paths.run_dir")
 
 
 def _value(cfg: DictConfig, key: str) -> Any:

@@ -34,7 +34,7 @@ from nerfdiff.inputs import LAST
 from nerfdiff.memory import WEIGHTS_ADAM_EMA, is_tight, within_memory
 from nerfdiff.modules.nerfdiff_module import NerfDiffModule
 from nerfdiff.processes import lost_process, watch
-from nerfdiff.results.files import held
+from nerfdiff.results.files import held, remove_leftovers
 from nerfdiff.results.hashes import sha256_file, sha256_values
 from nerfdiff.stopping import Stopped
 
@@ -66,6 +66,9 @@ def train(cfg: DictConfig) -> dict[str, float]:
 
 def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
     output_dir = Path(cfg.paths.output_dir)
+    if trainer.is_global_zero:
+        for folder in (output_dir, *(output_dir / name for name in ("checkpoints", "model", "previews", "snapshots"))):
+            remove_leftovers(folder)
     model_config = plain(cfg.model) | {"conditioning": plain(cfg.conditioning)}
     datamodule = instantiate(cfg.data)
     last = _checkpoint_to_resume(output_dir, cfg, model_config, datamodule)

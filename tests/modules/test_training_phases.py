@@ -112,7 +112,7 @@ def test_kept_renderings_are_what_would_be_rendered(batch, tmp_path):
     torch.testing.assert_close(first, rendered, atol=0.5 / 255 + 1e-5, rtol=0)
     assert torch.equal(first, second)
     with sqlite3.connect(keeping.kept.path) as file:
-        assert file.execute("SELECT count(*) FROM renderings").fetchone() == (4,)
+        assert file.execute("SELECT count(*) FROM checked").fetchone() == (4,)
 
 
 def test_kept_renderings_are_made_once(tmp_path):
@@ -165,7 +165,7 @@ def test_two_phases_as_a_person_runs_them(data, tmp_path):
             assert torch.equal(value, averaged[name]), name  # the field as it was given
     (kept,) = (tmp_path / "kept").glob("*/renderings.sqlite")
     with sqlite3.connect(kept) as file:
-        names = [name for (name,) in file.execute("SELECT name FROM renderings")]
+        names = [name for (name,) in file.execute("SELECT name FROM checked")]
     assert names and all(name.split("/")[1] == "000000" for name in names)  # one source view of each scene
 
     # what it was trained on goes with it

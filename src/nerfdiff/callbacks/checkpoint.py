@@ -14,7 +14,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 from nerfdiff.callbacks.nonfinite import NonFiniteGuard
 from nerfdiff.checkpoint import DIVERGED, LAST, PREVIOUS
-from nerfdiff.errors import CheckpointError, DataError, TrainingDiverged
+from nerfdiff.errors import CheckpointError, DataError, TrainingDiverged, size_text
 from nerfdiff.processes import is_launched
 from nerfdiff.results.files import atomic
 from nerfdiff.stopping import Stopped, on_signals
@@ -70,7 +70,7 @@ class LastCheckpoint(SoundCheckpoint):
         free = shutil.disk_usage(folder).free
         if free < needed:
             raise CheckpointError(
-                f"{folder} has {free / 2**20:.0f} MiB free; checkpoints of this model need {needed / 2**20:.0f} MiB. "
+                f"{folder} has {size_text(free)} free; checkpoints of this model need {size_text(needed)}. "
                 "Free some space or choose another paths.runs_dir"
             )
 
@@ -158,7 +158,7 @@ class ClearCheckpointIO(TorchCheckpointIO):
         except (OSError, RuntimeError, DataError) as error:  # torch turns a failed write into a RuntimeError
             free = shutil.disk_usage(path.parent).free
             raise CheckpointError(
-                f"cannot write {path}: {str(error).splitlines()[0]} ({free / 2**20:.0f} MiB free). The checkpoint "
+                f"cannot write {path}: {str(error).splitlines()[0]} ({size_text(free)} free). The checkpoint "
                 "before it is kept: free some space and run the same command again to go on from there"
             ) from error
 

@@ -12,8 +12,11 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from PIL.ExifTags import Base
 
 from nerfdiff.data.pinhole import ASPECT_TOLERANCE
+from nerfdiff.data.posed_files import require_file
 from nerfdiff.errors import DataError
 
+MAX_PIXELS = 64_000_000
+"""Of an image, which takes some 25 bytes of memory each until it is resized."""
 READ_FORMATS = {b"\x89PNG": "PNG", b"\xff\xd8\xff": "JPEG", b"RIFF": "WebP"}
 """First bytes of what most images are: one of these that Pillow does not know is damaged."""
 log = logging.getLogger(__name__)
@@ -164,6 +167,11 @@ def open_image(path: Path) -> Image.Image:
         DataError: as `decode`.
     """
     with _readable(path), Image.open(path) as image:
+        if image.height * image.width > MAX_PIXELS:
+            raise DataError(
+                f"{path}: {image.height}x{image.width} are {image.height * image.width / 1e6:.0f} million pixels, "
+                f"expected at most {MAX_PIXELS / 1e6:.0f} million; save it smaller"
+            )
         image.load()
         return image
 
@@ -172,7 +180,10 @@ def open_image(path: Path) -> Image.Image:
 def _readable(path: Path) -> Iterator[None]:
     """What Pillow raises on missing and damaged files, as one error that names the file."""
     try:
+        require_file(path)
         yield
+    except DataError:
+        raise
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such image") from error
     except UnidentifiedImageError as error:

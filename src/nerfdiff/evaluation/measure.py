@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import filelock
-import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from nerfdiff.cli import command_words
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.distill.strategy import Strategy
-from nerfdiff.errors import ConfigError, TimeUp
+from nerfdiff.errors import ConfigError, TimeUp, is_out_of_memory
 from nerfdiff.evaluation.costs import cost_fields, model_fields
 from nerfdiff.evaluation.dashboard import show_in_dashboard
 from nerfdiff.evaluation.subject import Subject, choose_device
@@ -76,7 +75,7 @@ def record_failure(cfg: DictConfig, error: Exception, subject: Subject | None, s
     status = "error"
     if isinstance(error, NonFinitePrediction):
         status = "nan"
-    elif isinstance(error, torch.cuda.OutOfMemoryError | MemoryError):
+    elif is_out_of_memory(error):
         status = "oom"
     elif isinstance(error, TimeUp):
         status = "timeout"

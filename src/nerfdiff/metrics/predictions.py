@@ -11,6 +11,7 @@ the next scene.
 """
 
 import fcntl
+import glob
 import json
 import os
 import shutil
@@ -27,7 +28,7 @@ from torch import Tensor
 
 from nerfdiff.errors import DataError
 from nerfdiff.metrics.image import quantise
-from nerfdiff.results.files import publish, write_text
+from nerfdiff.results.files import publish, remove_leftovers, write_text
 
 FORMAT = 2
 PLAN = "plan.json"
@@ -122,6 +123,7 @@ class PredictionWriter:
         except (BlockingIOError, PermissionError):  # what a lock that another holds is, by POSIX
             return False
         if not (self.folder / scene / SCENE).exists():
+            remove_leftovers(self.folder, f"{glob.escape(scene)}.*")
             return True
         self.release(scene)
         return False

@@ -2,6 +2,8 @@
 
 import errno
 import os
+import re
+import shutil
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -51,6 +53,21 @@ def write_text(path: Path, text: str) -> None:
     """Write `text` atomically, see `atomic`."""
     with atomic(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def remove_leftovers(folder: Path, name: str = "*") -> None:
+    """Remove what processes that were killed left half-written in a folder, which the caller holds.
+
+    Args:
+        name: of the files or folders that were to be written, without their suffix.
+    """
+    for left in Path(folder).glob(f".{name}.tmp*"):
+        if re.fullmatch(r"\..+\.\d+\.tmp(\..*)?", left.name) and f".{os.getpid()}.tmp" not in left.name:
+            if left.is_dir() and not left.is_symlink():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                with suppress(OSError):
+                    left.unlink()
 
 
 def publish(partial: Path, final: Path) -> None:

@@ -68,10 +68,8 @@ class KeptRenderings:
             if missing:
                 fresh = (render(missing).clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
                 pixels[missing] = fresh
-                rows = [
-                    (names[position], image.tobytes(), zlib.crc32(image))
-                    for position, image in zip(missing, fresh, strict=True)
-                ]
+                images = [image.tobytes() for image in fresh]
+                rows = [(names[p], image, zlib.crc32(image)) for p, image in zip(missing, images, strict=True)]
                 with self._file:
                     self._file.executemany("INSERT OR IGNORE INTO checked VALUES (?, ?, ?)", rows)
         except (OSError, sqlite3.Error, ValueError) as error:  # a ValueError: an image of another size, or damaged

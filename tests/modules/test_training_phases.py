@@ -81,17 +81,6 @@ def test_without_the_way_through_the_rendering_the_field_has_no_gradient_of_the_
     assert not torch.allclose(through[name], alone[name])
 
 
-def test_the_weighting_by_output_is_edms(batch):
-    """With x0 = αZ - σv, an error of v is one of x0 over σ; EDM's weight on x0's is SNR + 1/σ_data²."""
-    std, t = 0.2, torch.tensor([0.1, 0.5, 0.9, 0.99], dtype=torch.float64)
-    made = NerfDiffModule(
-        config(conditioning={"residual_std": std}), {"lambda_ic": 1, "lambda_dm": 1}, OPTIMIZER, [0.5], False, 0
-    )
-    alpha, sigma = torch.cos(torch.pi * t / 2), torch.sin(torch.pi * t / 2)
-    per_x0_error = 1 / (sigma * made.model.denoiser.output_scale(t)) ** 2
-    torch.testing.assert_close(per_x0_error, alpha**2 / sigma**2 + 1 / std**2)
-
-
 def test_every_target_has_a_time_of_its_own(batch, monkeypatch):
     seen = []
     made = module({})

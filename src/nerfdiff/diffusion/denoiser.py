@@ -98,13 +98,6 @@ class Denoiser(nn.Module):
         mean, scale = gaussian_velocity(z, 2 * condition.rendered - 1, self.residual_std, alpha, sigma)
         return mean + scale * output
 
-    def output_scale(self, t: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
-        """By how much the U-Net's output moves the predicted v."""
-        if self.residual_std is None:
-            return torch.ones_like(t)
-        alpha, sigma = alpha_sigma(t)
-        return self.residual_std / torch.sqrt(self.residual_std**2 * alpha**2 + sigma**2)
-
     def forward(
         self,
         z: Float[Tensor, "batch 3 height width"],

@@ -26,7 +26,7 @@ from nerfdiff.modules.kept_renderings import KeptRenderings
 from nerfdiff.randomness import generator, spread_times
 from nerfdiff.results.environment import git_state
 
-WHOLE = {"ray_share": 1.0, "through_rendering": True, "weighting": "v"}
+WHOLE = {"ray_share": 1.0, "through_rendering": True}
 """The paper's joint loss, which checkpoints from before there was another have."""
 
 
@@ -38,9 +38,7 @@ class NerfDiffModule(LightningModule):
         losses: `lambda_ic` and `lambda_dm`, 0 for a part that is not trained: without L^DM the field alone is, without
             L^IC the CDM alone, on the renderings of a field that stays as it is. `ray_share`: L^IC is measured on so
             many of a target's rays, drawn anew at every step. `through_rendering`: the gradient of L^DM flows back
-            through the rendering into the field (paper). `weighting` of L^DM over t: `v`, as its error has it, or
-            `output`, the error of what the U-Net itself puts out (EDM, Karras et al. 2022, arXiv 2206.00364, eq. 8),
-            which differs with a `residual_std` and asks more of noisy images.
+            through the rendering into the field (paper).
         optimizer: AdamW's `lr`, `weight_decay`, `betas`; `warmup_steps` of linear warm-up; `decay` is `none` or
             `cosine`, to zero at the end of training.
         validation_times: times t at which the denoising loss is measured on held-out views.
@@ -238,8 +236,7 @@ class NerfDiffModule(LightningModule):
         views = batch.target_cameras.shape[1]
         each = (batch.draws[:, None] * views + torch.arange(views, device=batch.draws.device)).flatten()
         times = spread_times(each, self.hparams.seed)
-        weighting = (WHOLE | self.hparams.losses)["weighting"]
-        return self._denoising_loss(condition, targets, eps.flatten(0, 1), times, weighting)
+        return self._denoising_loss(condition, targets, eps.flatten(0, 1), times)
 
     def _denoising_loss(
         self,
@@ -247,14 +244,10 @@ class NerfDiffModule(LightningModule):
         x0: Float[Tensor, "batch 3 height width"],
         eps: Float[Tensor, "batch 3 height width"],
         t: Float[Tensor, "batch"],
-        weighting: str = "v",
     ) -> Tensor:
         alpha, sigma = (expand(c, x0) for c in alpha_sigma(t))
         predicted = self.model.denoiser.velocity(add_noise(x0, eps, alpha, sigma), t, condition)
-        error = predicted - v_from_x0_eps(x0, eps, alpha, sigma)
-        if weighting == "output":
-            error = error / expand(self.model.denoiser.output_scale(t), x0)
-        return error.square().mean()
+        return F.mse_loss(predicted, v_from_x0_eps(x0, eps, alpha, sigma))
 
     def _noise(self, batch: ViewBatch, losses: Mapping) -> dict[str, Tensor]:
         """ε, the chosen rays and the ray jitter of every training item, each a function of its draw alone."""
@@ -279,8 +272,6 @@ def _check_losses(losses: Mapping, kept_renderings: str | None) -> None:
     ic, dm, share = losses["lambda_ic"], losses["lambda_dm"], losses["ray_share"]
     if ic < 0 or dm < 0 or ic == dm == 0:
         raise ConfigError(f"losses.lambda_ic={ic}, lambda_dm={dm}: neither may be negative, nor both be 0")
-    if losses["weighting"] not in ("v", "output"):
-        raise ConfigError(f"losses.weighting={losses['weighting']}: choose v or output")
     if not 0 < share <= 1:
         raise ConfigError(f"losses.ray_share={share}: expected a share above 0, at most 1")
     if losses["through_rendering"] and ic and dm and share < 1:

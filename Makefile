@@ -7,7 +7,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 LOGDIR ?= runs
 
-.PHONY: setup browser demo test lint dashboard clean
+.PHONY: setup browser demo test faults lint dashboard clean
 
 setup: $(VENV)/.installed
 
@@ -29,6 +29,10 @@ browser:
 
 test: setup lint browser
 	$(BIN)/python -m pytest
+
+# Kills, full disks, power cuts, damaged bytes and fuzzed values, for minutes; docs/reliability.md has the numbers.
+faults: setup
+	$(BIN)/python -m pytest tests/faults -m faults
 
 lint: setup
 	$(BIN)/ruff check .

@@ -1,5 +1,6 @@
 """The errors a person can mend: each message names what failed, what was expected and what to do."""
 
+import math
 from collections.abc import Collection
 
 
@@ -47,13 +48,9 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 def size_text(count: float) -> str:
     """Bytes as a person reads them: `512 bytes`, `3.4 MB`."""
-    for unit in ("bytes", "kB", "MB", "GB"):
-        if count < 1000:
-            break
-        count /= 1000
-    else:
-        unit = "TB"
-    return f"{count:.0f} {unit}" if unit == "bytes" else f"{count:.3g} {unit}" if count < 1000 else f"{count:.0f} {unit}"
+    power = min(4, int(math.log10(max(count, 1)) / 3))
+    value, unit = count / 1000**power, ("bytes", "kB", "MB", "GB", "TB")[power]
+    return f"{value:.0f} {unit}" if power == 0 or value >= 100 else f"{value:.3g} {unit}"
 
 
 def some(names: Collection[str], limit: int = 8) -> str:

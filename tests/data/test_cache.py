@@ -109,7 +109,7 @@ def test_images_of_several_sizes_are_an_error(root):
 def test_no_room_is_told_before_decoding(root, monkeypatch):
     usage = namedtuple("usage", "total used free")(10, 10, 1000)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-    with pytest.raises(DataError, match=r"toy_train-.*it takes 148 kB, and 1 kB are free.*data\.cache_dir.*data\.cache=false"):
+    with pytest.raises(DataError, match=r"takes 148 kB, and 1 kB are free.*data\.cache_dir.*data\.cache=false"):
         cached(root)
     assert caches(root) == set()
 

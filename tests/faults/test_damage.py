@@ -202,9 +202,22 @@ def test_exports_without_a_digest_are_read(exported):
     assert len(yaml.safe_load((ASSETS / "demo" / "model.yaml").read_text())["sha256"]) == 64
 
 
-@pytest.mark.parametrize("text", ["", "x", "- 1", "weights: ema", "!!python/object/apply:os.system [x]", "model: &a [*a]",
-                                  "{weights: ema, image_size: 3, model: {}}", "{weights: ema, image_size: null, model: x}",
-                                  "{weights: ema, image_size: null, model: {name: x}}", "\x00", "a: \xff"])  # fmt: skip
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "x",
+        "- 1",
+        "weights: ema",
+        "!!python/object/apply:os.system [x]",
+        "model: &a [*a]",
+        "{weights: ema, image_size: 3, model: {}}",
+        "{weights: ema, image_size: null, model: x}",
+        "{weights: ema, image_size: null, model: {name: x}}",
+        "\x00",
+        "a: \xff",
+    ],
+)
 def test_settings_beside_weights_that_are_none_are_refused(text, exported):
     (exported / "model.yaml").write_text(text, encoding="latin-1")
     with pytest.raises(CheckpointError, match=r"model\.(yaml cannot be read|safetensors does not fit its own)"):
@@ -233,6 +246,12 @@ def test_inverted_pixels_in_the_cache_are_refused(cache):
         copy.load(0, [1])
 
 
+def read_all(cache) -> None:
+    copy = cache()
+    for scene in range(len(copy)):
+        copy.load(scene)
+
+
 @pytest.mark.parametrize("name", ["scenes.json", "cameras.npz", "images.u8"])
 @pytest.mark.parametrize("how", ["flipped", "empty", "missing", "a folder", "another's"])
 def test_damaged_cache_metadata_are_refused(name, how, cache):
@@ -244,9 +263,7 @@ def test_damaged_cache_metadata_are_refused(name, how, cache):
             path.write_bytes(content)
             flip(path, 1, seed)
             with pytest.raises(DataError, match="damaged; delete this folder"):
-                copy = cache()
-                for scene in range(len(copy)):
-                    copy.load(scene)
+                read_all(cache)
         return
     if how == "a folder":
         path.mkdir()
@@ -261,7 +278,7 @@ def test_kept_renderings_are_checked(tmp_path):
     kept.get(["a"], (2, 2), lambda missing: torch.rand(1, 3, 2, 2))
     with sqlite3.connect(kept.path) as file:
         file.execute("UPDATE checked SET pixels = zeroblob(12)")
-    with pytest.raises(CheckpointError, match="bytes of a changed since they were written.*delete this folder"):
+    with pytest.raises(CheckpointError, match=r"bytes of a changed since they were written.*delete this folder"):
         kept.get(["a"], (2, 2), pytest.fail)
 
 

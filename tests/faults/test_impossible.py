@@ -222,7 +222,7 @@ def test_folders_that_cannot_be_written_are_refused(name, read_only, fault_data)
         (OSError(40, "Too many levels of symbolic links", "/x"), "/x: Too many levels of symbolic links"),
         (RuntimeError("Symlink loop from '/x'"), "Symlink loop from '/x'"),
         (MemoryError(), "memory ran out"),
-        (OSError("Caught OSError in DataLoader worker process 0.\nTraceback:\nOSError: [Errno 5] I/O"), "OSError: [Errno 5] I/O"),
+        (OSError("Caught OSError in DataLoader worker 0.\nTraceback:\nOSError: [Errno 5] I/O"), "OSError: [Errno 5] I/O"),
         (ValueError("a fault of the program's"), None),
     ],
 )  # fmt: skip

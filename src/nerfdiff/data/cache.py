@@ -4,8 +4,9 @@
 
 The name says what is in it, so a cache that is there is valid. It is built in a folder of another name,
 under a lock, and renamed when it is whole. The index (scenes.json) keeps SHA-256 of itself and of the cameras, and
-beside these are those of each image, which each process checks when it first reads the image. Images are read by position rather than through a memory map: that
-is 1.3 times as fast on pages mapped before and 4 times on others, and a shortened file is an error and no crash.
+these come with that of each image, which each process checks when it first reads the image. Images are read by
+position rather than through a memory map: that is 1.3 times as fast on pages mapped before and 4 times on others,
+and a shortened file is an error and no crash.
 """
 
 import errno

@@ -7,7 +7,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 LOGDIR ?= runs
 
-.PHONY: setup browser demo test lint dashboard clean
+.PHONY: setup browser demo test faults lint dashboard clean
 
 setup: $(VENV)/.installed
 
@@ -29,6 +29,10 @@ browser:
 
 test: setup lint browser
 	$(BIN)/python -m pytest
+
+# The long part of the fault-injection suite (tests/faults), with fixed seeds; docs/reliability.md has its numbers.
+faults: setup
+	$(BIN)/python -m pytest -m faults tests/faults
 
 lint: setup
 	$(BIN)/ruff check .

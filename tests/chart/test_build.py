@@ -288,7 +288,9 @@ def test_nothing_is_shown_from_outside_of_the_results(tmp_path):
     (results / "run" / "sheet.png").symlink_to(tmp_path / "private" / "sheet.png")
     (results / "link").symlink_to(tmp_path / "private")
     folders = ("../private", str(tmp_path / "private"), "link", "run", "run/../../private")
-    rows = [result(folder=folder, strategy="../..", run_id=folder, psnr=float(n)) for n, folder in enumerate(folders)]
+    rows = [
+        result(folder=folder, strategy="../..", overrides=[f"x={n}"], run_id=folder) for n, folder in enumerate(folders)
+    ]
     known = content(chart(write_results(results, *rows)))
     runs = [entry["runs"][0] for entry in known["configurations"]]
     assert [entry["small"] for entry in known["configurations"]] == [None] * 5
@@ -303,7 +305,8 @@ def test_nothing_is_shown_from_outside_of_the_results(tmp_path):
 def png_header(width: int, height: int) -> bytes:
     """The beginning of a picture that claims to be so large."""
     size = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + size + struct.pack(">I", zlib.crc32(size))
+    chunk = struct.pack(">I", 13) + size + struct.pack(">I", zlib.crc32(size))
+    return b"\x89PNG\r\n\x1a\n" + chunk + struct.pack(">I", 999) + b"IDAT" + b"\0" * 20
 
 
 @pytest.mark.parametrize(
@@ -316,6 +319,7 @@ def png_header(width: int, height: int) -> bytes:
         (b"", "cannot identify image file"),
         (None, "it is no file"),
     ],
+    ids=["2.5 gigapixels", "169 megapixels", "torn", "PostScript", "empty", "pipe"],
 )
 def test_a_picture_that_cannot_be_shown_is_told_and_costs_nothing(tmp_path, sheet, words):
     (tmp_path / "run").mkdir()
@@ -347,8 +351,9 @@ WORDS = (
 
 
 def test_no_text_of_a_row_is_more_than_text(tmp_path):
+    same = {"dataset": "$x^{$", "device": "=$\\`$", "st_lpips_vgg": None}
     rows = [
-        result("good", strategy=word, dataset=word, device=word, overrides=[word, f"x={word}"], run_id=word, error=word)
+        result(strategy=word, overrides=[word, f"x={word}"], run_id=word, error=word, model=word, **same)
         for word in WORDS
     ]
     page = chart(write_results(tmp_path, *rows), png__costs=["scene_s"])
@@ -358,12 +363,14 @@ def test_no_text_of_a_row_is_more_than_text(tmp_path):
         for line in read_csv(page.parent / name):
             assert not any(cell.startswith(("=", "+", "-", "@", "\t")) for cell in line.values() if cell)
             assert line["strategy"].removeprefix("'") in WORDS
-    assert len(list(page.parent.glob("psnr-*.png"))) == len(WORDS)
+    assert [path.name for path in page.parent.glob("*.png")] == ["psnr-scene_s.png"]
 
 
 def test_pictures_of_very_much_or_very_long_text_are_of_bounded_size(tmp_path):
     rows = [
-        result(strategy=f"s{n}" + "x" * 5000, scene_s=timing(1.0 + n), psnr=20.0 + n, dataset="d" * 10_000)
+        result(
+            strategy=f"s{n}" + "x" * 5000, scene_s=timing(1.0 + n), psnr=20.0 + n, dataset="d" * 9999, st_lpips_vgg=None
+        )
         for n in range(30)
     ]
     page = chart(write_results(tmp_path, *rows), png__costs=["scene_s"], png__lines=5)
@@ -371,12 +378,22 @@ def test_pictures_of_very_much_or_very_long_text_are_of_bounded_size(tmp_path):
         assert image.size[0] == 1080 and image.size[1] < 2000
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, 1e-99, 9e99, float("nan"), float("inf"), float("-inf")])
-def test_impossible_numbers_make_a_page(tmp_path, value):
-    rows = [result(psnr=value), result("slow", scene_s=timing(value, value)), result("best", n_scenes=0)]
-    page = chart(write_results(tmp_path, *rows, result("cheap"), result(seed=1)), png__costs=["scene_s"])
-    assert len(content(page)["configurations"]) == 4
-    assert len(list(page.parent.glob("psnr-scene_s*.png"))) == 2
+@pytest.mark.parametrize("values", [(0.0, -1.0), (1e-99, 9e99), (float("nan"), float("inf"), float("-inf"))])
+def test_impossible_numbers_make_a_page(tmp_path, values):
+    rows = [
+        result(name, overrides=[f"x={value}"], st_lpips_vgg=None, **{field: number})
+        for value in values
+        for name, field, number in (("good", "psnr", value), ("slow", "scene_s", timing(value, value)))
+    ]
+    rows += [result("cheap", st_lpips_vgg=None), result(seed=1, st_lpips_vgg=None)]
+    page = chart(write_results(tmp_path, *rows), png__costs=["scene_s"])
+    known = content(page)
+    assert len(known["configurations"]) == 2 * len(values) + 2
+    assert len(known["panels"][0]["frontiers"]["psnr"]["scene_s"]) and (page.parent / "psnr-scene_s.png").is_file()
+
+
+def test_runs_that_say_that_they_had_no_scenes_make_a_page(tmp_path):
+    assert len(content(chart(write_results(tmp_path, result(n_scenes=0, n_views=0))))["configurations"]) == 1
 
 
 def test_a_folder_that_cannot_be_read_is_told(tmp_path, monkeypatch):

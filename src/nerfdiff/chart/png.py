@@ -20,7 +20,7 @@ from nerfdiff.results.text import one_line
 INK, PAPERS = "#1d2430", "#6b4a00"
 KINDS = ("#0b62b8", "#d1570a", "#1a8a5a", "#8a4fbf", "#b3261e", "#0f8fa3", "#8a6d1d", "#c2408f", "#5d8a00", "#5c6675")
 FAINT = 0.3
-LONGEST = 400  # letters of a name
+LONGEST, SHORT = 400, 40  # letters of a name below the axes, and in the legend
 LINE, LETTERS = 0.16, 18  # inches of a line below the axes, and letters of it to an inch
 
 
@@ -73,9 +73,9 @@ def write_png(
     if metric["better"] == "lower":
         axes.invert_yaxis()
     axes.grid(alpha=0.25)
-    axes.set_title(plain(f"{panel.device}: {panel.data}"), fontsize=9)
+    axes.set_title(plain(fill(one_line(f"{panel.device}: {panel.data}", LONGEST), int(12 * size[0]))), fontsize=9)
     dots = [
-        Line2D([], [], color=colour, marker="o", ls="", label=plain(name))
+        Line2D([], [], color=colour, marker="o", ls="", label=plain(one_line(name, SHORT)))
         for (name, _), colour in zip(kinds, KINDS, strict=False)
     ]
     axes.legend(handles=dots, fontsize=7, loc="best")
@@ -88,8 +88,8 @@ def write_png(
 
 
 def plain(text: str) -> str:
-    """Text of rows for matplotlib: no formula, no control characters, of bounded length, and not hidden in legends."""
-    text = "\n".join(one_line(line, LONGEST) for line in text.split("\n")).replace("$", "\\$")
+    """Text of rows for matplotlib: no formula, no control characters, and not hidden in legends."""
+    text = "\n".join(one_line(line) for line in text.split("\n")).replace("$", "\\$")
     return f" {text}" if text.startswith("_") else text
 
 

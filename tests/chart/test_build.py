@@ -381,7 +381,7 @@ def test_pictures_of_very_much_or_very_long_text_are_of_bounded_size(tmp_path):
 @pytest.mark.parametrize("values", [(0.0, -1.0), (1e-99, 9e99), (float("nan"), float("inf"), float("-inf"))])
 def test_impossible_numbers_make_a_page(tmp_path, values):
     rows = [
-        result(name, overrides=[f"x={value}"], st_lpips_vgg=None, **{field: number})
+        result(name, overrides=[f"{field}={value}"], st_lpips_vgg=None, **{field: number})
         for value in values
         for name, field, number in (("good", "psnr", value), ("slow", "scene_s", timing(value, value)))
     ]

@@ -90,7 +90,8 @@ def check_limits(config: DictConfig) -> None:
     Raises:
         ConfigError: naming the key, its value and what it can be.
     """
-    for key, value in _numbers(config):
+    # what was set before what follows from it: the message is to name the key that a person set
+    for key, value, _ in sorted(_values(config), key=lambda found: found[2]):
         check_limit(key, value)
 
 
@@ -110,8 +111,8 @@ def check_limit(key: str, value: Any) -> None:
             raise ConfigError(f"{key}={value} must be {words}")
 
 
-def _numbers(config: DictConfig, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """The values of all keys but Hydra's own, without those that are known only later."""
+def _values(config: DictConfig, prefix: str = "") -> Iterator[tuple[str, Any, bool]]:
+    """All keys but Hydra's own, their values, and whether these are another key's; not what is known only later."""
     for key in config:
         if f"{prefix}{key}" == "hydra":
             continue
@@ -120,6 +121,7 @@ def _numbers(config: DictConfig, prefix: str = "") -> Iterator[tuple[str, Any]]:
         except (OmegaConfBaseException, ValueError):  # a ValueError: Hydra has not begun
             continue
         if isinstance(value, DictConfig):
-            yield from _numbers(value, f"{prefix}{key}.")
+            yield from _values(value, f"{prefix}{key}.")
         else:
-            yield f"{prefix}{key}", OmegaConf.to_container(value) if OmegaConf.is_list(value) else value
+            value = OmegaConf.to_container(value) if OmegaConf.is_list(value) else value
+            yield f"{prefix}{key}", value, OmegaConf.is_interpolation(config, key)

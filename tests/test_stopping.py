@@ -255,6 +255,16 @@ def test_a_diverging_run_keeps_the_checkpoint_from_before(data, run, monkeypatch
     assert last_checkpoint(run)["global_step"] == 5
 
 
+def test_trying_again_what_goes_wrong_at_once_costs_no_checkpoint(data, run, monkeypatch):
+    """Steps 2 and 1 are there, and sound; as where the data or the GPU is broken and a scheduler starts anew."""
+    diverge(monkeypatch, at=0)
+    for _ in range(3):
+        with pytest.raises(TrainingDiverged, match=r"Step 1 is saved in .*last\.ckpt"):
+            run_training(data, run, *EVERY_STEP, "trainer.max_steps=20")
+    steps = {p.name: torch.load(p, weights_only=True)["global_step"] for p in (run / "checkpoints").glob("*.ckpt")}
+    assert steps["last.ckpt"] == 1 and steps["diverged.ckpt"] == 2
+
+
 def test_a_run_that_never_was_well_says_so(data, tmp_path, monkeypatch):
     diverge(monkeypatch, at=1)
     with pytest.raises(TrainingDiverged, match="No checkpoint is from before that: start afresh"):

@@ -21,6 +21,7 @@ from nerfdiff.checkpoint import (
     check_resumable,
     check_same_data,
     describe,
+    differences,
     export_model,
     last_checkpoint,
     load_model,
@@ -84,7 +85,13 @@ def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
     )
     if cfg.init is not None and last is None:
         begun = load_model(cfg.init, "ema", cfg.paths.assets_dir)
-        module.model.load_state_dict(begun.model.state_dict())
+        try:
+            module.model.load_state_dict(begun.model.state_dict())
+        except RuntimeError as error:  # of other names or sizes
+            changed = "; ".join(differences(begun.config, model_config, "model."))
+            raise CheckpointError(
+                f"init={cfg.init} does not fit this run's model ({changed}): use its settings"
+            ) from error
         module.trained_before = list(begun.trained_on)
     module.model.renderer = replace(module.model.renderer, backend=cfg.backend, kernel_precision=cfg.kernel_precision)
     compile_unets(module.model, cfg.compile, cfg.paths.compiled_dir)
@@ -119,6 +126,11 @@ def _kept_renderings(cfg: DictConfig, data: SceneDataModule) -> str | None:
         return None
     if cfg.init is None:
         raise ConfigError("kept_renderings are of the field that init=<checkpoint> brings: set init, or it to null")
+    if data.source_target_noise:
+        raise ConfigError(
+            f"kept_renderings are of the views' own cameras, and data.source_target_noise={data.source_target_noise} "
+            "moves some of these at every step: set it to 0, or kept_renderings to null"
+        )
     reader, init = data.reader("train"), load_model(cfg.init, "ema", cfg.paths.assets_dir)
     what = [sha256_file(init.path), plain(cfg.model.render), reader.identity, reader.fingerprint()]
     return str(Path(cfg.kept_renderings) / sha256_values(what)[:12])
@@ -200,7 +212,7 @@ def _sound(output_dir: Path) -> str:
         check_finite(last)
     except CheckpointError as error:
         return f"{error}: start afresh"
-    return f"{describe(last)} Its weights are finite and good steps followed it: the same command goes on from there"
+    return f"{describe(last)} Its weights are finite: the same command goes on from there"
 
 
 def _announce(module: NerfDiffModule, last: Path | None, device: torch.device) -> None:

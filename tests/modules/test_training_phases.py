@@ -81,6 +81,11 @@ def test_without_the_way_through_the_rendering_the_field_has_no_gradient_of_the_
     assert not torch.allclose(through[name], alone[name])
 
 
+def test_a_share_of_rays_that_rounds_to_all_is_all(batch):
+    whole, rounded = (gradients(module({"lambda_dm": 0, "ray_share": share}), batch) for share in (1, 0.999))
+    assert whole.keys() == rounded.keys()
+
+
 def test_every_target_has_a_time_of_its_own(batch, monkeypatch):
     seen = []
     made = module({})
@@ -180,5 +185,13 @@ def test_two_phases_as_a_person_runs_them(data, tmp_path):
 def test_kept_renderings_need_a_field_that_stays(data, tmp_path):
     with pytest.raises(ConfigError, match="init=<checkpoint>"):
         run_training(data, tmp_path / "a", "losses.lambda_ic=0", f"kept_renderings={tmp_path}")
+    moving = ["losses.lambda_ic=0", "init=demo", f"kept_renderings={tmp_path}", "data.source_target_noise=0.3"]
+    with pytest.raises(ConfigError, match=r"data\.source_target_noise=0\.3 moves"):
+        run_training(data, tmp_path / "b", *moving)
     with pytest.raises(ConfigError, match=r"losses\.lambda_ic=0"):
         module({}, kept_renderings=str(tmp_path))
+
+
+def test_a_model_to_begin_with_must_fit(data, tmp_path):
+    with pytest.raises(CheckpointError, match=r"init=demo does not fit this run's model \(.*field\.channels: \d+ → 4"):
+        run_training(data, tmp_path, "init=demo")

@@ -40,7 +40,8 @@ class LastCheckpoint(SoundCheckpoint):
     processes, lets the step end; the second ends the run at once.
 
     While steps go wrong nothing is saved. Where the run then diverges, a checkpoint that no good step followed is set
-    aside as `diverged.ckpt`, and the one before takes its place.
+    aside as `diverged.ckpt`, and the one before takes its place. Where not even the first
+    step was good, that is done once, and if there is one before: trying again must not cost all checkpoints.
 
     Args:
         dirpath: folder of the checkpoints.
@@ -57,6 +58,7 @@ class LastCheckpoint(SoundCheckpoint):
         )
         self._due = False
         self._proven = False  # whether a good step followed the last checkpoint
+        self._well = False  # whether any step of this process was good
         self._signum = 0
         self._agreed = False  # whether all processes end after the same step
         self._handlers = ExitStack()
@@ -82,7 +84,9 @@ class LastCheckpoint(SoundCheckpoint):
         if not _between_steps(trainer):
             return
         step = trainer.global_step
-        self._proven |= _guard(trainer).upset == 0 and step > self._last_global_step_saved
+        good = _guard(trainer).upset == 0
+        self._well |= good
+        self._proven |= good and step > self._last_global_step_saved
         self._due |= step % self._every_n_train_steps == 0
         asked = _most(trainer, self._signum)
         # The last step too; once `fit` ends, the EMA callback has put its average where the raw weights were.
@@ -135,6 +139,8 @@ class LastCheckpoint(SoundCheckpoint):
 
     def _set_aside(self) -> None:
         last, previous, diverged = (Path(self.dirpath) / name for name in (LAST, PREVIOUS, DIVERGED))
+        if not self._well and (diverged.exists() or not previous.exists()):
+            return
         if last.exists():
             os.replace(last, diverged)
         if previous.exists():

@@ -97,6 +97,7 @@ class SceneDataModule(LightningDataModule):
             "val_scenes": val_scenes,
             "val_targets": val_targets,
             "train_scenes": 1 if train_scenes is None else train_scenes,
+            "train_source_views": 1 if train_source_views is None else train_source_views,
             "eval_scenes": 1 if eval_scenes is None else eval_scenes,
             "eval_stride": eval_stride,
         }

@@ -263,7 +263,7 @@ class NerfDiffModule(LightningModule):
             noise["eps"] = torch.stack(
                 [torch.randn(targets.shape[1:], generator=g, device=g.device) for g in generators]
             )
-        if some < rays:
+        if losses["ray_share"] < 1:
             noise["rays"] = torch.stack([torch.randperm(rays, generator=g, device=g.device)[:some] for g in generators])
         return noise
 

@@ -6,7 +6,7 @@ import re
 import zipfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -153,10 +153,20 @@ def _unexpected(checkpoint: Any) -> str | None:
         ("image_size", False, lambda value: value is None or _is_size(value), "[height, width]"),
         ("stability", False, lambda value: isinstance(value, Mapping), "numbers by name"),
         ("SceneDataModule", False, _is_text_by_name, "what it was trained on"),
+        ("trained_on", False, _are_phases, "what it was trained on"),
     ):
         if (needed or key in checkpoint) and not possible(checkpoint.get(key)):
             return f"expected {expected} as its {key}, found a {type(checkpoint.get(key)).__name__}"
     return None
+
+
+def _are_phases(value: Any) -> bool:
+    """Whether this is a list of what `NerfDiffModule.trained_on` says of each training."""
+    kinds = {"part": str, "images": int, "scenes": int, "dataset": str, "about": str}
+    return isinstance(value, list) and all(
+        isinstance(phase, Mapping) and all(isinstance(phase.get(key), kind) for key, kind in kinds.items())
+        for phase in value
+    )
 
 
 def _is_size(value: Any) -> bool:
@@ -217,7 +227,7 @@ def export_model(loaded: LoadedModel, folder: str | Path, dtype: torch.dtype) ->
 
 
 def export(
-    ckpt: str,
+    ckpt: str | Path,
     weights: str,
     out: str | Path,
     dtype: str,
@@ -239,7 +249,12 @@ def export(
         raise ConfigError(f"dtype must be one of {', '.join(DTYPES)}, got {dtype!r}")
     loaded = load_model(ckpt, weights, assets)
     if average is not None:
-        loaded.model.load_state_dict(average_of(Path(ckpt) / SNAPSHOTS, average, step), strict=False)
+        state = average_of(Path(ckpt) / SNAPSHOTS, average, step)
+        if state.keys() != dict(loaded.model.named_parameters()).keys():
+            raise CheckpointError(f"the snapshots in {Path(ckpt) / SNAPSHOTS} are of another model than {loaded.path}")
+        loaded.model.load_state_dict(state, strict=False)  # buffers are no part of an average
+        phases = [*loaded.trained_on[:-1], *({**phase, "average": average} for phase in loaded.trained_on[-1:])]
+        loaded = replace(loaded, trained_on=phases)
     return export_model(loaded, out, DTYPES[dtype])
 
 
@@ -304,6 +319,8 @@ def _read_export(path: Path, weights: str) -> Read:
         image_size, digest = settings["image_size"], settings.get("sha256")
         if not isinstance(config, Mapping) or not isinstance(settings.get("stability", {}), Mapping):
             raise TypeError("expected settings by name as its model")
+        if not _are_phases(settings.get("trained_on", [])):
+            raise TypeError("expected what it was trained on as its trained_on")
         if image_size is not None and not _is_size(image_size):
             raise TypeError(f"expected [height, width] as its image_size, found {image_size!r}")
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:

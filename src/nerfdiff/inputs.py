@@ -24,13 +24,14 @@ def checkpoints(run: str | Path) -> list[Path]:
     return [Path(run) / "checkpoints" / name for name in (LAST, PREVIOUS)]
 
 
-def find_weights(ckpt: str | Path, assets: str | Path | None) -> Path:
+def find_weights(ckpt: str | Path, assets: str | Path | None, key: str = "ckpt") -> Path:
     """The file of a model's weights.
 
     Args:
         ckpt: a Lightning `.ckpt`; a run's folder (its last checkpoint); a folder written by `export_model`; or the
             name of such a folder in `assets`, as `demo`.
         assets: folder of shipped models; None is the one that comes with the program.
+        key: that named it, for the message.
 
     Raises:
         CheckpointError: there is no such file.
@@ -41,7 +42,7 @@ def find_weights(ckpt: str | Path, assets: str | Path | None) -> Path:
     if path is None:
         shipped = sorted(file.parent.name for file in assets.glob(f"*/{WEIGHTS}"))
         raise CheckpointError(
-            f"ckpt={ckpt} is neither a file nor a folder of a run; looked for "
+            f"{key}={ckpt} is neither a file nor a folder of a run; looked for "
             f"{', '.join(map(str, candidates))}. Shipped models: {', '.join(shipped) or 'none'}"
         )
     return path
@@ -53,7 +54,7 @@ def check_inputs(
     """Refuse a composed config whose checkpoint, picture, dataset or results are not there.
 
     Args:
-        keys: what the command reads, among `ckpt`, `image`, `picture.mask`, `data.root` and `results`. With an
+        keys: what the command reads, among `ckpt`, `init`, `image`, `picture.mask`, `data.root` and `results`. With an
             `image` no dataset is read.
         swept: keys that every job of a sweep sets for itself, which are the jobs' to check.
         only: keys whose files are looked for; None is all.
@@ -65,8 +66,8 @@ def check_inputs(
         value = None if key in swept else _value(cfg, key)
         if value is None or (only is not None and key not in only) or (key == "data.root" and cfg.get("image")):
             continue
-        if key == "ckpt":
-            find_weights(value, cfg.paths.assets_dir)
+        if key in ("ckpt", "init"):
+            find_weights(value, cfg.paths.assets_dir, key)
         elif key == "data.root":
             if not Path(value).is_dir():
                 raise DataError(f"data.root={value}: no such folder; set data.root to the folder of the dataset")

@@ -8,7 +8,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, Quote, QuotedString
 from hydra.errors import HydraException
 
-PATHS = re.compile(r"ckpt|image|mask|out|root|results|run|dir|\w+_dir|\w+_weights")
+PATHS = re.compile(r"ckpt|init|kept_renderings|image|mask|out|root|results|run|dir|\w+_dir|\w+_weights")
 """Last parts of the keys that take paths."""
 
 

@@ -25,13 +25,14 @@ from nerfdiff.checkpoint import (
     export_model,
     last_checkpoint,
     load_model,
+    read_checkpoint,
 )
 from nerfdiff.compilation import compile_unets
 from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.diffusion.layout import channels_last
 from nerfdiff.diffusion.unet import AUTO
 from nerfdiff.errors import CheckpointError, ConfigError, ProcessLost, TrainingDiverged
-from nerfdiff.inputs import LAST
+from nerfdiff.inputs import LAST, find_weights
 from nerfdiff.memory import WEIGHTS_ADAM_EMA, is_tight, within_memory
 from nerfdiff.modules.nerfdiff_module import NerfDiffModule
 from nerfdiff.processes import lost_process, watch
@@ -83,16 +84,8 @@ def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
         seed=cfg.seed,
         kept_renderings=_kept_renderings(cfg, datamodule),
     )
-    if cfg.init is not None and last is None:
-        begun = load_model(cfg.init, "ema", cfg.paths.assets_dir)
-        try:
-            module.model.load_state_dict(begun.model.state_dict())
-        except RuntimeError as error:  # of other names or sizes
-            changed = "; ".join(differences(begun.config, model_config, "model."))
-            raise CheckpointError(
-                f"init={cfg.init} does not fit this run's model ({changed}): use its settings"
-            ) from error
-        module.trained_before = list(begun.trained_on)
+    if last is None:
+        _begin(module, cfg, model_config)
     module.model.renderer = replace(module.model.renderer, backend=cfg.backend, kernel_precision=cfg.kernel_precision)
     compile_unets(module.model, cfg.compile, cfg.paths.compiled_dir)
     _announce(module, last, trainer.strategy.root_device)
@@ -120,19 +113,32 @@ def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
     return {name: float(value) for name, value in trainer.callback_metrics.items()}
 
 
+def _begin(module: NerfDiffModule, cfg: DictConfig, model_config: dict) -> None:
+    """Give a new run the weights of `cfg.init`."""
+    if cfg.init is None:
+        if module.frozen_field:
+            raise ConfigError("losses.lambda_ic=0 trains the CDM on a field that stays as it is: set init=<checkpoint>")
+        return
+    begun = load_model(cfg.init, "ema", cfg.paths.assets_dir)
+    try:
+        module.model.load_state_dict(begun.model.state_dict())
+    except RuntimeError as error:  # of other names or sizes
+        changed = "; ".join(differences(begun.config, model_config, "model."))
+        raise CheckpointError(f"init={cfg.init} does not fit this run's model ({changed}): use its settings") from error
+    module.trained_before, module.begun_from = list(begun.trained_on), sha256_file(begun.path)
+
+
 def _kept_renderings(cfg: DictConfig, data: SceneDataModule) -> str | None:
-    """The folder of a frozen field's renderings: its name says which field sees which data."""
+    """The folder for a frozen field's renderings: its name says how which data are rendered."""
     if not cfg.kept_renderings:
         return None
-    if cfg.init is None:
-        raise ConfigError("kept_renderings are of the field that init=<checkpoint> brings: set init, or it to null")
     if data.source_target_noise:
         raise ConfigError(
             f"kept_renderings are of the views' own cameras, and data.source_target_noise={data.source_target_noise} "
             "moves some of these at every step: set it to 0, or kept_renderings to null"
         )
-    reader, init = data.reader("train"), load_model(cfg.init, "ema", cfg.paths.assets_dir)
-    what = [sha256_file(init.path), plain(cfg.model.render), reader.identity, reader.fingerprint()]
+    reader = data.reader("train")
+    what = [plain(cfg.model.render), reader.identity, reader.fingerprint()]
     return str(Path(cfg.kept_renderings) / sha256_values(what)[:12])
 
 
@@ -200,6 +206,14 @@ def _checkpoint_to_resume(output_dir: Path, cfg: DictConfig, model_config: dict,
         if not cfg.other_data:
             raise
         log.warning("%s", error)
+    begun_from = read_checkpoint(last).get("begun_from")
+    if cfg.init is not None and begun_from is not None:
+        init = find_weights(cfg.init, cfg.paths.assets_dir)
+        if sha256_file(init) != begun_from:
+            raise CheckpointError(
+                f"the run of {last} began with other weights than init={cfg.init} has now ({init}): choose another "
+                "run_name to start afresh with these, or leave init out to go on"
+            )
     return last
 
 

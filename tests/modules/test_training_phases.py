@@ -6,9 +6,11 @@ import sqlite3
 import pytest
 import torch
 import torch.nn.functional as F
+from safetensors.torch import save_file
 
 from model_fixtures import config
-from nerfdiff.checkpoint import load_model
+from nerfdiff.callbacks.snapshots import average_of
+from nerfdiff.checkpoint import export, load_model
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.errors import CheckpointError, ConfigError
 from nerfdiff.modules.kept_renderings import KeptRenderings
@@ -157,7 +159,7 @@ def test_two_phases_as_a_person_runs_them(data, tmp_path):
             assert not torch.equal(value, before[name])  # trained
         elif not name.startswith("denoiser"):
             assert torch.equal(value, averaged[name]), name  # the field as it was given
-    (kept,) = (tmp_path / "kept").glob("*/renderings.sqlite")
+    (kept,) = (tmp_path / "kept").glob("*/*/renderings.sqlite")
     with sqlite3.connect(kept) as file:
         names = [name for (name,) in file.execute("SELECT name FROM checked")]
     assert names and all(name.split("/")[1] == "000000" for name in names)  # one source view of each scene
@@ -195,3 +197,38 @@ def test_kept_renderings_need_a_field_that_stays(data, tmp_path):
 def test_a_model_to_begin_with_must_fit(data, tmp_path):
     with pytest.raises(CheckpointError, match=r"init=demo does not fit this run's model \(.*field\.channels: \d+ → 4"):
         run_training(data, tmp_path, "init=demo")
+
+
+def test_a_run_goes_on_with_what_it_began_with(data, tmp_path):
+    """Else its renderings would be of one field under the name of another."""
+    for name in ("a", "b"):
+        run_training(data, tmp_path / name, *FIELD, f"seed={'ab'.index(name)}", "trainer.max_steps=1")
+    words = ["losses.lambda_ic=0", f"kept_renderings={tmp_path / 'kept'}"]
+    with pytest.raises(ConfigError, match="set init=<checkpoint>"):
+        run_training(data, tmp_path / "cdm", *words)
+    run_training(data, tmp_path / "cdm", *words, f"init={tmp_path / 'a'}", "trainer.max_steps=1")
+    with pytest.raises(CheckpointError, match="began with other weights than init="):
+        run_training(data, tmp_path / "cdm", *words, f"init={tmp_path / 'b'}", "trainer.max_steps=2")
+    run_training(data, tmp_path / "cdm", *words, f"init={tmp_path / 'a'}", "trainer.max_steps=2")
+    run_training(data, tmp_path / "other", *words, f"init={tmp_path / 'b'}", "trainer.max_steps=1")
+    assert len(list((tmp_path / "kept").glob("*/*/renderings.sqlite"))) == 2  # one for each field
+
+
+def test_averages_are_of_the_model_they_are_exported_with(data, tmp_path):
+    settings = "{_target_: nerfdiff.callbacks.snapshots.Snapshots, folder: %s, every_n_steps: 1, lengths: [0.05, 0.1]}"
+    run = tmp_path / "run"
+    run_training(data, run, f"callbacks.snapshots={settings % (run / 'snapshots')}")
+    export(run, "ema", tmp_path / "out", "float32", None, average=0.1)
+    made, expected = load_model(tmp_path / "out", "ema"), average_of(run / "snapshots", 0.1)
+    assert made.trained_on[-1]["average"] == 0.1
+    assert all(torch.equal(value, expected[name]) for name, value in made.model.named_parameters())
+    save_file({"other": torch.zeros(1)}, run / "snapshots/step_0000006_0.1.safetensors", {"step": "6", "length": "0.1"})
+    with pytest.raises(CheckpointError, match="of another model"):
+        export(run, "ema", tmp_path / "out", "float32", None, average=0.1)
+    (run / "snapshots/step_0000001_0.1.safetensors").write_bytes(b"x" * 99)
+    with pytest.raises(CheckpointError, match="not a readable snapshot"):
+        export(run, "ema", tmp_path / "out", "float32", None, average=0.1)
+    settings = (tmp_path / "out/model.yaml").read_text()
+    (tmp_path / "out/model.yaml").write_text(settings.replace("images: 24", "images: many"))
+    with pytest.raises(CheckpointError, match="trained_on"):
+        load_model(tmp_path / "out", "ema")

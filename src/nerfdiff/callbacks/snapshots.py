@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -127,14 +127,19 @@ def average_of(folder: str | Path, length: float, step: int | None = None) -> Ma
     """The average of `length`, up to `step` (None: the last), from a run's snapshots; fp32.
 
     Raises:
-        CheckpointError: there are no snapshots, or none up to that step.
+        CheckpointError: there are no snapshots, none up to that step, or one is damaged.
         ConfigError: no average has that length.
     """
     found = []
     for path in sorted(Path(folder).glob("step_*.safetensors")):
-        with safe_open(path, "pt") as file:
-            about = file.metadata()
-        found.append((int(about["step"]), float(about["length"]), path))
+        try:
+            with safe_open(path, "pt") as file:
+                about = file.metadata()
+            found.append((int(about["step"]), float(about["length"]), path))
+        except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+            raise CheckpointError(
+                f"{path} is not a readable snapshot ({error!r}); delete it to go without it"
+            ) from error
     steps = sorted({known for known, _, _ in found})
     if not found or (step is not None and step not in steps):
         raise CheckpointError(f"{folder} has no snapshots{f' of step {step}' if found else ''}; it has steps {steps}")

@@ -5,7 +5,7 @@ from omegaconf import DictConfig
 from nerfdiff.cli import entry_point
 
 
-@entry_point("train", "data.root")
+@entry_point("train", "data.root", "init")
 def main(cfg: DictConfig) -> float | None:
     """Returns the held-out PSNR, which a sweep may optimise."""
     from nerfdiff.training import train  # slow to import: not for --cfg

@@ -152,6 +152,7 @@ class SceneDataModule(LightningDataModule):
 
     def setup(self, stage: str) -> None:
         if stage == "fit":
+            _ = self._trained_on  # of the files as they are now, not at the first checkpoint
             self.train_reader = self.reader("train")
             if self.cache:
                 name = f"{self.name}_{self.splits['train']}"

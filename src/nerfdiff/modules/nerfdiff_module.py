@@ -1,5 +1,6 @@
 """Joint training of the single-image NeRF and the CDM (paper, "Training Phase")."""
 
+import hashlib
 import math
 from collections.abc import Mapping
 from contextlib import nullcontext
@@ -66,7 +67,8 @@ class NerfDiffModule(LightningModule):
         self.save_hyperparameters(ignore=["kept_renderings"])
         self.model = NerfDiff(**model)
         self.frozen_field = losses["lambda_ic"] == 0
-        self.kept = KeptRenderings(kept_renderings) if kept_renderings else None
+        self._kept_folder, self._kept = kept_renderings, None
+        self.begun_from: str | None = None  # SHA-256 of `init`'s weights
         if self.frozen_field:
             self.model.encoder.requires_grad_(False)
             self.model.decoder.requires_grad_(False)
@@ -150,9 +152,22 @@ class NerfDiffModule(LightningModule):
         checkpoint["accumulate_grad_batches"] = self.trainer.accumulate_grad_batches
         checkpoint["image_size"] = self.image_size
         checkpoint["trained_on"] = self.trained_on()
+        checkpoint["begun_from"] = self.begun_from
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.trained_before = list(checkpoint.get("trained_on", [{}])[:-1])
+        self.begun_from = checkpoint.get("begun_from")
+
+    @property
+    def kept(self) -> KeptRenderings | None:
+        """The frozen field's renderings, in a folder named by the weights that render them."""
+        if self._kept is None and self._kept_folder is not None:
+            weights = hashlib.sha256()
+            for part in (self.model.encoder, self.model.decoder):
+                for value in part.state_dict().values():
+                    weights.update(value.cpu().contiguous().numpy().tobytes())
+            self._kept = KeptRenderings(Path(self._kept_folder) / weights.hexdigest()[:12])
+        return self._kept
 
     def trained_on(self) -> list[dict[str, Any]]:
         """What the weights have seen: one entry for each training that led here, this one last."""

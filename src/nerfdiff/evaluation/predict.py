@@ -52,7 +52,7 @@ def predict(subject: Subject, strategy: Strategy, rank: int = 0, processes: int 
     if subject.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(subject.device)
     with Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),

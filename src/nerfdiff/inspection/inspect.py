@@ -56,7 +56,7 @@ def inspect_data(cfg: DictConfig) -> list[SplitSummary]:
     report = write_report(folder, title, splits)
     print_report(console, title, splits, cfg.listed)
     pictures = [folder / name for split in splits for name in split.pictures.values()]
-    console.print("Open:", *(f"  {path}" for path in [*report, *pictures]), sep="\n", soft_wrap=True)
+    console.print("Open:", *(f"  {path}" for path in [*report, *pictures]), sep="\n", soft_wrap=True, markup=False)
     failures = [f"{split.stage}: {', '.join(split.failures)}" for split in splits if split.failures]
     if failures:
         raise DataError(f"{datamodule.root}: {'; '.join(failures)}; see {report[0]}")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 from rich.console import Console
+from rich.markup import escape
 from rich.rule import Rule
 
 from nerfdiff.cli import command_words, load_config
@@ -30,7 +31,8 @@ def demo(cfg: DictConfig) -> None:
     console, started, run = Console(), time.perf_counter(), Path(cfg.run)
 
     def announce(command: str, overrides: list[str]) -> list[str]:
-        console.print(Rule(" ".join(command_words(command))), f"[dim]{shlex.join(overrides)}[/dim]", soft_wrap=True)
+        command_line = Rule(escape(" ".join(command_words(command))))
+        console.print(command_line, f"[dim]{escape(shlex.join(overrides))}[/dim]", soft_wrap=True)
         return overrides
 
     def prepare(command: str, overrides: list[str]) -> DictConfig:
@@ -50,5 +52,7 @@ def demo(cfg: DictConfig) -> None:
 
     pictures = [run / "distillation" / name for name in ("grid.png", "orbits.mp4", "table.md")]
     pictures += sorted((run / "evaluation").glob("*/sheet.png"))
-    console.print("Open:", *(f"  {path}" for path in pictures if path.exists()), f"  {run / 'previews'}", sep="\n")
+    console.print(
+        "Open:", *(f"  {path}" for path in pictures if path.exists()), f"  {run / 'previews'}", sep="\n", markup=False
+    )
     console.print(f"{(time.perf_counter() - started) / 60:.1f} minutes")

@@ -79,10 +79,20 @@ def other(rng: random.Random, line: bytes) -> bytes:
 DAMAGE: tuple[Callable[[random.Random, bytes], bytes], ...] = (retyped, retyped, truncated, flipped, deep, other)
 
 
+HOSTILE = "[/bold]\x1b[2J\n$x^{$|<b>"
+
+
+def hostile() -> ResultRow:
+    """A whole row, of which every text is meant to do harm."""
+    texts = dict.fromkeys(("dataset", "device", "model", "field", "weights", "folder", "error", "command"), HOSTILE)
+    return result(strategy=HOSTILE, overrides=[f"strategy={HOSTILE}", HOSTILE], run_id="hostile", **texts)
+
+
 def damaged_file(path: Path, seed: int, lines: int) -> int:
     """Good rows of `KNOWN`, and damaged lines between them; returns how many lines are not empty."""
     rng = random.Random(seed)
-    good = [json.dumps(encode(asdict(result(name, folder=f"run{n}")))).encode() for n, name in enumerate(KNOWN)]
+    rows = [hostile(), *(result(name, folder=f"run{n}") for n, name in enumerate(KNOWN))]
+    good = [json.dumps(encode(asdict(row))).encode() for row in rows]
     bad = [rng.choice(DAMAGE)(rng, rng.choice(good)) for _ in range(lines)]
     content = [*bad, *good]
     rng.shuffle(content)
@@ -97,7 +107,7 @@ def check_reading(path: Path, lines: int) -> list[ResultRow]:
     file = RowFile(path)
     rows = file.read()
     assert len(rows) + file.skipped.lines == lines
-    assert {f"{name}-0" for name in KNOWN} <= {row.run_id for row in rows}
+    assert {"hostile", *(f"{name}-0" for name in KNOWN)} <= {row.run_id for row in rows}
     return rows
 
 

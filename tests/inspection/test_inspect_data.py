@@ -1,5 +1,6 @@
 """The whole command on small datasets: what it writes, prints, and how it ends."""
 
+import io
 import json
 import re
 from pathlib import Path
@@ -8,12 +9,14 @@ import numpy as np
 import pytest
 from hydra.utils import instantiate
 from PIL import Image
+from rich.console import Console
 from solids import HEIGHT, WIDTH, write_solids
 
 from nerfdiff.cli import load_config
 from nerfdiff.errors import DataError
+from nerfdiff.inspection.bounds_plot import Distances, write_bounds_plot
 from nerfdiff.inspection.inspect import inspect_data
-from nerfdiff.inspection.report import markdown
+from nerfdiff.inspection.report import markdown, print_report
 from nerfdiff.inspection.summary import SplitSummary, summarise_split
 from nerfdiff.inspection.survey import Sample, sampled, survey_split
 from posed_fixtures import CENTRE, write_nerfstudio
@@ -211,3 +214,15 @@ def test_a_root_that_is_not_there_is_one_error(tmp_path):
     with pytest.raises(DataError, match="no such folder; set"):
         run(tmp_path / "nowhere", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_names_of_data_are_no_markup(tmp_path):
+    name = "[/bold]<b>$x^{$\x1b[2J"
+    split = SplitSummary("train", "train", scenes=1, sizes={name: 1}, bad={name: name})
+    absent = SplitSummary("test", "test", absent=name)
+    console = Console(file=io.StringIO(), width=200)
+    print_report(console, name, [split, absent], 5)
+    assert "[/bold]<b>$x^{$ [2J" in console.file.getvalue() and "\x1b" not in console.file.getvalue()
+    text = markdown(name, [split, absent])
+    assert "<b>" not in text and "# [/bold]&lt;b>" in text and "- [/bold]&lt;b>" in text
+    write_bounds_plot(tmp_path / "b.png", [Distances(np.array([1.0, 2.0]), 0.5, 3.0, "surfaces")], name, 4, 40)

@@ -15,7 +15,7 @@ from nerfdiff.chart.panels import Panel
 from nerfdiff.chart.payload import Measured
 from nerfdiff.results.files import atomic
 from nerfdiff.results.intervals import Estimate
-from nerfdiff.results.text import one_line
+from nerfdiff.results.text import figure_text, one_line
 
 INK, PAPERS = "#1d2430", "#6b4a00"
 KINDS = ("#0b62b8", "#d1570a", "#1a8a5a", "#8a4fbf", "#b3261e", "#0f8fa3", "#8a6d1d", "#c2408f", "#5d8a00", "#5c6675")
@@ -53,7 +53,7 @@ def write_png(
     told = [_told(number, content.names[n], at[n], metric, cost) for number, n in enumerate(best[:lines], 1)]
     if len(best) > lines:
         told.append(f"and {len(best) - lines} more, in configurations.csv")
-    told = [plain(fill(text, int(LETTERS * size[0]), subsequent_indent="    ")) for text in told]
+    told = [figure_text(fill(text, int(LETTERS * size[0]), subsequent_indent="    ")) for text in told]
     height = size[1] + LINE * sum(text.count("\n") + 1 for text in told)
     figure = Figure(figsize=(size[0], height), dpi=dpi, layout="constrained")
     axes = figure.subplots()
@@ -73,9 +73,9 @@ def write_png(
     if metric["better"] == "lower":
         axes.invert_yaxis()
     axes.grid(alpha=0.25)
-    axes.set_title(plain(fill(one_line(f"{panel.device}: {panel.data}", LONGEST), int(12 * size[0]))), fontsize=9)
+    axes.set_title(figure_text(fill(one_line(f"{panel.device}: {panel.data}", LONGEST), int(12 * size[0]))), fontsize=9)
     dots = [
-        Line2D([], [], color=colour, marker="o", ls="", label=plain(one_line(name, SHORT)))
+        Line2D([], [], color=colour, marker="o", ls="", label=figure_text(one_line(name, SHORT)))
         for (name, _), colour in zip(kinds, KINDS, strict=False)
     ]
     axes.legend(handles=dots, fontsize=7, loc="best")
@@ -85,12 +85,6 @@ def write_png(
         warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a name in letters of another script
         FigureCanvasAgg(figure).print_png(temporary)
     return path
-
-
-def plain(text: str) -> str:
-    """Text of rows for matplotlib: no formula, no control characters, and not hidden in legends."""
-    text = "\n".join(one_line(line) for line in text.split("\n")).replace("$", "\\$")
-    return f" {text}" if text.startswith("_") else text
 
 
 def _kinds(strategies: Mapping[int, str]) -> list[tuple[str, list[int]]]:

@@ -32,7 +32,12 @@ class SceneProgress(AbstractContextManager):
         self._began = self._said = time.monotonic()
         shown = every is not None and total > 0
         self._every = every if shown and not sys.stderr.isatty() else None
-        columns = (TextColumn(name), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+        columns = (
+            TextColumn(name, markup=False),
+            BarColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.description}", markup=False),
+        )
         self._bar = Progress(*columns, console=Console(stderr=True), disable=not shown or self._every is not None)
         self._task = self._bar.add_task(self._where(), total=total)
 

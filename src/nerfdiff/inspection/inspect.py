@@ -59,7 +59,7 @@ def inspect_data(cfg: DictConfig) -> list[SplitSummary]:
     report = write_report(folder, title, splits)
     print_report(console, title, splits, cfg.listed)
     pictures = [folder / name for split in splits for name in split.pictures.values()]
-    console.print("Open:", *(f"  {path}" for path in [*report, *pictures]), sep="\n", soft_wrap=True)
+    console.print("Open:", *(f"  {path}" for path in [*report, *pictures]), sep="\n", soft_wrap=True, markup=False)
     failures = [f"{split.stage}: {', '.join(split.failures)}" for split in splits if split.failures]
     if failures:
         raise DataError(f"{datamodule.root}: {'; '.join(failures)}; see {report[0]}")
@@ -82,7 +82,7 @@ def _survey(
     sample = Sample(
         cfg.sample.scenes, cfg.sample.views, cfg.bounds_plot.distances, cfg.sheet.scenes, cfg.sheet.views, cfg.seed
     )
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     steps = len(reader) + len(sampled(len(reader), cfg.sample.scenes, ""))
     with Progress(*columns, disable=not sys.stderr.isatty(), console=Console(stderr=True)) as bar:
         task = bar.add_task(f"{stage}: listing and reading scenes", total=steps)

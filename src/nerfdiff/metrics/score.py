@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 from jaxtyping import UInt8
+from rich.markup import escape
 from rich.progress import track
 from torch import Tensor
 
@@ -119,7 +120,7 @@ class Scorer:
         quiet = not sys.stderr.isatty()
         scenes = [
             session.scene(number, folder, scene, truth)
-            for number, scene in enumerate(track(planned, f"scoring {folder.name}", disable=quiet))
+            for number, scene in enumerate(track(planned, escape(f"scoring {folder.name}"), disable=quiet))
         ]
         summary = summarise(scenes) | session.sets()
         summary["ssim_impl"] = image_metrics.SSIM_IMPL

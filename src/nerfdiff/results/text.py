@@ -33,6 +33,12 @@ def markdown_lines(rows: Iterable[Sequence[str]]) -> str:
     return "".join("| " + " | ".join(line) + " |\n" for line in [headings, ["---"] * len(headings), *body])
 
 
+def figure_text(text: str) -> str:
+    """Text for matplotlib: no formula, no control characters, and not hidden in legends."""
+    text = "\n".join(one_line(line) for line in text.split("\n")).replace("$", "\\$")
+    return f" {text}" if text.startswith("_") else text
+
+
 def csv_cell(value: Any) -> Any:
     """A value as a cell of a CSV: a text that a spreadsheet would compute begins with an apostrophe instead."""
     if not isinstance(value, str):

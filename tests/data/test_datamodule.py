@@ -41,6 +41,8 @@ def datamodule(root, **changes) -> SceneDataModule:
         "cache": True,
         "cache_dir": root / "cache",
         "seed": 3,
+        "train_source_views": None,
+        "about": "made by a test",
     }
     return SceneDataModule(**settings | changes)
 

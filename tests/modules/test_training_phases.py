@@ -81,6 +81,17 @@ def test_without_the_way_through_the_rendering_the_field_has_no_gradient_of_the_
     assert not torch.allclose(through[name], alone[name])
 
 
+def test_every_target_has_a_time_of_its_own(batch, monkeypatch):
+    seen = []
+    made = module({})
+    velocity = made.model.denoiser.velocity
+    monkeypatch.setattr(
+        made.model.denoiser, "velocity", lambda z, t, c: (seen.extend(t.tolist()), velocity(z, t, c))[1]
+    )
+    made.training_step(batch, 0)
+    assert len(set(seen)) == 4  # two draws of two targets
+
+
 def test_kept_renderings_are_what_would_be_rendered(batch, tmp_path):
     plain, keeping = module({"lambda_ic": 0}), module({"lambda_ic": 0}, kept_renderings=str(tmp_path))
     encoding = plain.model.encode(batch.source, batch.source_cameras, batch.near, batch.far)
@@ -90,7 +101,7 @@ def test_kept_renderings_are_what_would_be_rendered(batch, tmp_path):
     torch.testing.assert_close(first, rendered, atol=0.5 / 255 + 1e-5, rtol=0)
     assert torch.equal(first, second)
     with sqlite3.connect(keeping.kept.path) as file:
-        assert file.execute("SELECT count(*) FROM renderings").fetchone() == (4,)
+        assert file.execute("SELECT count(*) FROM checked").fetchone() == (4,)
 
 
 def test_kept_renderings_are_made_once(tmp_path):
@@ -124,8 +135,15 @@ def test_losses_that_cannot_be(losses, message):
 
 def test_two_phases_as_a_person_runs_them(data, tmp_path):
     field = tmp_path / "field"
-    run_training(data, field, *FIELD)
-    more = ["losses.lambda_ic=0", f"init={field}", f"kept_renderings={tmp_path / 'kept'}", "data.train_source_views=1", "optimizer.decay=none"]
+    run_training(data, field, *FIELD, "data.about=tests")
+    more = [
+        "losses.lambda_ic=0",
+        f"init={field}",
+        f"kept_renderings={tmp_path / 'kept'}",
+        "data.train_source_views=1",
+        "optimizer.decay=none",
+        "data.about=tests",
+    ]
     run_training(data, tmp_path / "cdm", *more)
     before, after = (load_model(run, "raw", "assets").model.state_dict() for run in (field, tmp_path / "cdm"))
     averaged = load_model(field, "ema", "assets").model.state_dict()
@@ -136,8 +154,18 @@ def test_two_phases_as_a_person_runs_them(data, tmp_path):
             assert torch.equal(value, averaged[name]), name  # the field as it was given
     (kept,) = (tmp_path / "kept").glob("*/renderings.sqlite")
     with sqlite3.connect(kept) as file:
-        names = [name for (name,) in file.execute("SELECT name FROM renderings")]
+        names = [name for (name,) in file.execute("SELECT name FROM checked")]
     assert names and all(name.split("/")[1] == "000000" for name in names)  # one source view of each scene
+
+    # what it was trained on goes with it
+    phases = load_model(tmp_path / "cdm" / "model", "ema").trained_on
+    assert [(p["part"], p["images"], p["scenes"], p["about"]) for p in phases] == [
+        ("field", 24, 3, "tests"), ("CDM", 24, 3, "tests")
+    ]  # fmt: skip
+    assert (
+        "24 images for the field of 3 scenes of srn_cars (tests), then 24 images for the CDM"
+        in load_model(tmp_path / "cdm", "ema").describe()
+    )
 
     # stopped and resumed: the same bits, whatever is kept already
     half = tmp_path / "half"

@@ -97,13 +97,23 @@ def markdown(title: str, splits: Sequence[SplitSummary]) -> str:
 
 
 def _notes(split: SplitSummary) -> list[str]:
+    notes = []
     if split.scenes_read and not split.compared:
-        return ["not checked whether cameras fit the images: there is no depth, silhouette or texture to tell by"]
+        notes = [
+            "cameras unchecked: there is no depth, silhouette or texture to tell by whether they fit the images; look "
+            "at the pictures" + ("" if split.allow_unchecked else ", then let them pass with allow_unchecked=true")
+        ]
+    elif split.compared < split.scenes_read:
+        notes = [f"cameras unchecked in {split.scenes_read - split.compared} of {split.scenes_read} scenes"]
+    if split.compared and not split.focal_told:
+        notes.append("focal length unchecked: silhouettes hardly change with it; compare it with the data's source")
     if split.explanations is None or not any(found.status is Status.FAILED for found in split.checks):
-        return []  # a few suspects are no reason to doubt all cameras
+        return notes  # a few suspects are no reason to doubt all cameras
     if not split.explanations:
-        return ["no common misreading of cameras (axes, inverse, transposed, other resolution) explains the failure"]
-    return [f"every check of the cameras would pass if {name}" for name in split.explanations]
+        notes.append(
+            "no common misreading of cameras (axes, inverse, transposed, other resolution) explains the failure"
+        )
+    return notes + [f"every check of the cameras would pass if {name}" for name in split.explanations]
 
 
 def _suspects(split: SplitSummary) -> list[str]:

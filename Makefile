@@ -27,8 +27,9 @@ browser:
 		DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends chromium >/dev/null; } || \
 		echo "no Chromium: the tests of the chart's page will be skipped"
 
+# A process for every core, of which each takes about 1.5 GB; one that has nothing left takes over half of another's tests.
 test: setup lint browser
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist worksteal
 
 # Kills, full disks, power cuts, damaged bytes and fuzzed values, for minutes; docs/reliability.md has the numbers.
 faults: setup

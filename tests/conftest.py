@@ -1,10 +1,19 @@
-"""Shapes and types of annotated functions are checked while tests run (and only then: the hook breaks compilation)."""
+"""Shapes and types of annotated functions are checked while tests run (and only then: the hook breaks compilation).
+
+Each process takes one thread, those that tests start included: `make test` has a process for every core, and threads
+only wait for each other on tensors as small as these.
+"""
+
+import os
+
+os.environ["OMP_NUM_THREADS"] = "1"  # before torch is imported
 
 import torch
 from jaxtyping import install_import_hook
 
 from triton_interpreter import interpret_kernels
 
+torch.set_num_threads(1)
 if not torch.cuda.is_available():
     interpret_kernels()
 

@@ -22,7 +22,7 @@ from nerfdiff.field.kinds import TRIPLANE
 from nerfdiff.inputs import LAST, PREVIOUS, WEIGHTS, find_weights
 from nerfdiff.model import NerfDiff, build_on_meta
 from nerfdiff.results.files import atomic, write_text
-from nerfdiff.results.hashes import sha256_file
+from nerfdiff.results.hashes import sha256_file, sha256_values
 
 CONFIG, SNAPSHOTS = "model.yaml", "snapshots"
 DIVERGED, DAMAGED = "diverged.ckpt", "damaged.ckpt"
@@ -219,9 +219,9 @@ def export_model(loaded: LoadedModel, folder: str | Path, dtype: torch.dtype) ->
     with atomic(folder / WEIGHTS) as temporary:
         save_file(state, temporary)
     settings = {"weights": loaded.weights, "image_size": loaded.image_size, "model": dict(loaded.config)}
-    settings["sha256"] = sha256_file(folder / WEIGHTS)
     settings |= {"stability": dict(loaded.stability)} if loaded.stability else {}
     settings |= {"trained_on": [dict(phase) for phase in loaded.trained_on]} if loaded.trained_on else {}
+    settings["sha256"] = _digest(folder / WEIGHTS, settings)
     write_text(folder / CONFIG, yaml.safe_dump(settings, sort_keys=False))
     return folder / WEIGHTS
 
@@ -316,7 +316,7 @@ def _read_export(path: Path, weights: str) -> Read:
     try:
         settings = yaml.safe_load(path.with_name(CONFIG).read_text())
         stored, config = settings["weights"], settings["model"]
-        image_size, digest = settings["image_size"], settings.get("sha256")
+        image_size, digest = settings["image_size"], settings.pop("sha256", None)
         if not isinstance(config, Mapping) or not isinstance(settings.get("stability", {}), Mapping):
             raise TypeError("expected settings by name as its model")
         if not _are_phases(settings.get("trained_on", [])):
@@ -333,12 +333,16 @@ def _read_export(path: Path, weights: str) -> Read:
         state = load_file(path)
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{path} is not a readable safetensors file ({error})") from error
-    if digest is not None and digest != sha256_file(path):  # exports from before have none
+    if digest is not None and digest != _digest(path, settings):  # exports from before have none
         raise CheckpointError(
-            f"{path} is not the file that {path.with_name(CONFIG)} was written for (its SHA-256 is another): one of "
-            "the two is damaged or was exchanged. Export or copy both anew"
+            f"{path} and {path.with_name(CONFIG)} are not as they were written together (their SHA-256 is another): "
+            "one of the two was damaged, edited or exchanged. Export or copy both anew"
         )
     return config, state, settings
+
+
+def _digest(weights: Path, settings: Mapping) -> str:
+    return sha256_values([sha256_file(weights), settings])
 
 
 def _build(config: Mapping, state: dict[str, torch.Tensor], path: Path) -> NerfDiff:
@@ -352,7 +356,8 @@ def _build(config: Mapping, state: dict[str, torch.Tensor], path: Path) -> NerfD
         model = NerfDiff(**config)
         model.load_state_dict({name: value.float() for name, value in state.items()})
     except Exception as error:  # settings of any kind surface as whatever a module trips over
-        raise CheckpointError(f"{path} does not fit its own settings: {error}") from error
+        reason = " ".join(str(error).split())[:300]
+        raise CheckpointError(f"{path} does not fit its own settings: {reason}") from error
     return model.eval()
 
 

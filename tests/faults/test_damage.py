@@ -189,7 +189,16 @@ def test_exported_weights_are_checked(exported):
     load_model(exported, "ema")
     size = weights.stat().st_size
     flip(weights, 1, seed=1, start=size // 2, end=size)
-    with pytest.raises(CheckpointError, match=r"model\.safetensors is not the file that .*model\.yaml was written for"):
+    with pytest.raises(CheckpointError, match=r"model\.safetensors and .*model\.yaml are not as they were written"):
+        load_model(exported, "ema")
+
+
+def test_exported_settings_are_checked(exported):
+    """Also where the model can be built with the others."""
+    text = (exported / "model.yaml").read_text()
+    assert text.count("density_shift: -3.0") == 1
+    (exported / "model.yaml").write_text(text.replace("density_shift: -3.0", "density_shift: -1.0"))
+    with pytest.raises(CheckpointError, match="damaged, edited or exchanged"):
         load_model(exported, "ema")
 
 

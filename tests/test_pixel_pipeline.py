@@ -67,7 +67,7 @@ def test_a_run_of_another_field_is_not_gone_on_with(data, tmp_path):
     other, same = (load_config("train", [*words, f"field={name}"]) for name in ("pixelnerf", "triplane"))
     model = plain(same.model) | {"conditioning": plain(same.conditioning)}
     del model["field"]["name"]  # as of a run from before fields had names
-    torch.save({"hyper_parameters": {"model": model}, "state_dict": {}}, tmp_path / "last.ckpt")
+    torch.save({"hyper_parameters": {"model": model}, "state_dict": {}, "global_step": 0}, tmp_path / "last.ckpt")
     check_resumable(tmp_path / "last.ckpt", plain(same.model) | {"conditioning": plain(same.conditioning)}, 1)
     with pytest.raises(CheckpointError, match=r"model\.field\.name: triplane → pixelnerf"):
         check_resumable(tmp_path / "last.ckpt", plain(other.model) | {"conditioning": plain(other.conditioning)}, 1)

@@ -42,6 +42,9 @@ class Reader:
     def view_names(self, index):
         return tuple(f"{i:06d}" for i in range(len(self.levels[self.scene_id(index)])))
 
+    def listing(self, index):
+        raise NotImplementedError
+
     def load(self, index, views=None, truth=False):
         levels = torch.tensor(self.levels[self.scene_id(index)], dtype=torch.uint8)
         views = list(range(len(levels)) if views is None else views)

@@ -54,6 +54,9 @@ class Reader:
     def view_names(self, index):
         return NAMES
 
+    def listing(self, index):
+        raise NotImplementedError
+
     def load(self, index, views=None, truth=False):
         views = list(range(VIEWS) if views is None else views)
         cameras = ring(VIEWS, SIZE)

@@ -52,8 +52,8 @@ def test_names_with_brackets_are_no_markup(rows):
     ]
     console = Console(file=io.StringIO(), width=120)
     console.print(rich_table(found, 120, title="of x[/bold]"))
-    text = console.file.getvalue()
-    assert all(word in text for word in ("s[bold]", "x[/bold]/test", " [2Jw", "of x[/bold]")) and "\x1b" not in text
+    text = "".join(console.file.getvalue().split())  # a narrow table breaks lines
+    assert all(word in text for word in ("s[bold]", "x[/bold]/test", "[2Jw", "ofx[/bold]")) and "\x1b" not in text
 
 
 def test_a_narrow_table_keeps_whole_columns_and_names_the_others():

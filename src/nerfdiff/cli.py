@@ -147,12 +147,17 @@ def _compose_each(config_name: str, groups: list[list[Override]]) -> list[DictCo
     for choice in (choice for choices in groups for choice in choices):
         _check_choice(choice)
     first = [choices[0].input_line for choices in groups]
-    configs = [_compose(config_name, first, with_hydra=True)]
+    configs = [_composed(config_name, *first)]
     for index, choices in enumerate(groups):
         for choice in choices[1:]:
-            overrides = [*first[:index], choice.input_line, *first[index + 1 :]]
-            configs.append(_compose(config_name, overrides, with_hydra=True))
+            configs.append(_composed(config_name, *first[:index], choice.input_line, *first[index + 1 :]))
     return configs
+
+
+@functools.cache
+def _composed(config_name: str, *choices: str) -> DictConfig:
+    """The config of these choices, with Hydra's own node: to be read alone, since the next call gets it too."""
+    return _compose(config_name, list(choices), with_hydra=True)
 
 
 def _compose(config_name: str, overrides: list[str], with_hydra: bool = False) -> DictConfig:

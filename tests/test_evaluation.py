@@ -32,6 +32,7 @@ def config(data, run, out, *more):
         run,
         out,
         "orbit.frames=4",
+        "metrics.st_lpips=false",  # of every image of every row: only where it is looked at
         *more,
     )
     return load_config("evaluate", overrides)
@@ -39,7 +40,7 @@ def config(data, run, out, *more):
 
 @pytest.mark.parametrize("strategy", [["strategy=none"], ["strategy=cdm", "strategy.steps=3"]])
 def test_an_evaluation_leaves_rows_scores_and_pictures(data, run, tmp_path, strategy):
-    rows = evaluate(config(data, run, tmp_path, *strategy))
+    rows = evaluate(config(data, run, tmp_path, "metrics.st_lpips=true", *strategy))
     name = rows[0].strategy
     assert [row.strategy for row in rows] == [name, "copy_input", "mean_image"]
     assert [row.strategy for row in read_rows(tmp_path / "results.jsonl")] == [row.strategy for row in rows]
@@ -166,7 +167,7 @@ def test_an_all_white_scene_is_finite_and_reported(data, run, tmp_path):
     white = sorted((tmp_path / "data" / "cars_test").iterdir())[0]
     for path in (white / "rgb").iterdir():
         Image.new("RGB", Image.open(path).size, "white").save(path)
-    rows = evaluate(config(tmp_path / "data", run, tmp_path / "out"))
+    rows = evaluate(config(tmp_path / "data", run, tmp_path / "out", "metrics.st_lpips=true"))
     copy = rows[1]
     assert copy.blank_scenes == 1
     assert copy.psnr == pytest.approx((60 + copy.psnr_without_blank) / 2, abs=1e-3)
@@ -244,7 +245,7 @@ def test_predictions_name_their_source_view(data, run, tmp_path):
 
 
 def test_samples_per_ray_can_be_other_ones_than_in_training(data, run, tmp_path):
-    settings = ["baselines=false", "metrics.st_lpips=false", "orbit.scenes=0", "sheet.scenes=0"]
+    settings = ["baselines=false", "orbit.scenes=0", "sheet.scenes=0"]
     asked = ["uniform_samples=2", "importance_samples=3"]
     few, trained = (evaluate(config(data, run, tmp_path, *settings, *more))[0] for more in (asked, []))
     assert (few.samples_per_ray, trained.samples_per_ray) == (5, 8)

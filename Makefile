@@ -7,7 +7,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 LOGDIR ?= runs
 
-.PHONY: setup browser demo test lint dashboard clean
+.PHONY: setup browser demo test faults lint dashboard clean
 
 setup: $(VENV)/.installed
 
@@ -30,6 +30,10 @@ browser:
 # A process for every core, of which each takes about 1.5 GB; one that has nothing left takes over half of another's tests.
 test: setup lint browser
 	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist worksteal
+
+# Kills, full disks, power cuts, damaged bytes and fuzzed values, for minutes; docs/reliability.md has the numbers.
+faults: setup
+	$(BIN)/python -m pytest tests/faults -m faults
 
 lint: setup
 	$(BIN)/ruff check .

@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.table import Table
 
 from nerfdiff.cli import load_config
-from nerfdiff.data import images
+from nerfdiff.data import images, masks
 from nerfdiff.data.cache import CachedReader
 from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.data.scene import SceneReader
@@ -56,7 +56,7 @@ def measure(arguments: argparse.Namespace, data: DictConfig) -> list[tuple[str, 
     seconds = time.perf_counter() - start
     total = sum(len(cached.view_names(index)) for index in range(len(cached)))
     print(f"cache of {total} images: built in {seconds:.2f} s, {total / seconds:,.0f} images/s")
-    files, masks = files_read(reader, arguments.images)
+    files, mask_files = files_read(reader, arguments.images)
 
     def repeated(function: Callable[[], int]) -> list[float]:
         function()
@@ -68,8 +68,8 @@ def measure(arguments: argparse.Namespace, data: DictConfig) -> list[tuple[str, 
         return rates
 
     results = [
-        ("read the files", repeated(lambda: read_alone(files, masks))),
-        ("decode the files", repeated(lambda: decode_alone(files, masks))),
+        ("read the files", repeated(lambda: read_alone(files, mask_files))),
+        ("decode the files", repeated(lambda: decode_alone(files, mask_files))),
         ("reader, 2 views at a time", repeated(lambda: load_pairs(reader, arguments.images))),
         ("cached reader, 2 views at a time", repeated(lambda: load_pairs(cached, arguments.images))),
     ]
@@ -88,21 +88,21 @@ def files_read(reader: SceneReader, count: int) -> tuple[list[Path], list[Path]]
     """The images, and the masks beside them, that the reader decodes for so many views."""
     with (
         patch.object(images, "decode", wraps=images.decode) as decode,
-        patch.object(images, "decode_mask", wraps=images.decode_mask) as decode_mask,
+        patch.object(masks, "open_image", wraps=masks.open_image) as open_mask,
     ):
         load_pairs(reader, count)
-    return tuple([Path(call.args[0]) for call in calls.call_args_list] for calls in (decode, decode_mask))
+    return tuple([Path(call.args[0]) for call in calls.call_args_list] for calls in (decode, open_mask))
 
 
-def read_alone(files: list[Path], masks: list[Path]) -> int:
+def read_alone(files: list[Path], mask_files: list[Path]) -> int:
     """Images read, with their masks."""
-    return sum(len(file.read_bytes()) > 0 for file in [*files, *masks]) - len(masks)
+    return sum(len(file.read_bytes()) > 0 for file in [*files, *mask_files]) - len(mask_files)
 
 
-def decode_alone(files: list[Path], masks: list[Path]) -> int:
+def decode_alone(files: list[Path], mask_files: list[Path]) -> int:
     """Images decoded, with their masks."""
-    for mask in masks:
-        images.decode_mask(mask)
+    for mask in mask_files:
+        masks.read_mask(mask)
     return sum(images.decode(file).shape[2] == 3 for file in files)
 
 

@@ -1,17 +1,6 @@
 """Train NerfDiff: `python src/train.py model=large data=srn_cars data.root=/data/srn_cars`."""
 
-from omegaconf import DictConfig
-
-from nerfdiff.cli import entry_point
-
-
-@entry_point("train")
-def main(cfg: DictConfig) -> float | None:
-    """Returns the held-out PSNR, which a sweep may optimise."""
-    from nerfdiff.training import train  # slow to import: not for --cfg
-
-    return train(cfg).get("val/psnr")
-
+from nerfdiff.commands.train import main
 
 if __name__ == "__main__":
     main()

@@ -67,7 +67,7 @@ def test_the_papers_numbers():
         ("optimizer=1", ["optimizer takes paper or small, got 1"]),
         ("model.unet.channel_mult=3", ["model.unet.channel_mult takes a list (default [1, 1, 2, 3, 4]), got 3"]),
         ("model.unet.channel_mult=[1,2],3", ["takes a list", "got 3"]),
-        ("model.unet=wide", ["model.unet takes a mapping (keys width, channel_mult", "'wide'"]),
+        ("model.unet=wide", ["model.unet takes a mapping (keys width, patch, channel_mult", "'wide'"]),
         ("trainer.max_steps=[10]", ["takes int"]),
     ],
 )
@@ -177,6 +177,7 @@ def test_config_errors_are_explained():
 def test_a_command_ends_with_the_explanation(monkeypatch, tmp_path):
     arguments = ["hydra/job_logging=none", "hydra/hydra_logging=none", "hydra.output_subdir=null"]
     monkeypatch.setattr(sys, "argv", ["evaluate.py", *arguments, f"hydra.run.dir={tmp_path}"])
+    monkeypatch.setattr("nerfdiff.cli.quieten", lambda: None)  # the loggers are those of all tests
     command = entry_point("evaluate")(lambda cfg: cfg.ckpt)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     with pytest.raises(SystemExit) as end:

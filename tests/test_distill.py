@@ -3,12 +3,16 @@
 import csv
 import dataclasses
 import json
+import os
+import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 
 import numpy as np
+import psutil
 import pytest
 import torch
 from hydra.utils import instantiate
@@ -18,12 +22,15 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from nerfdiff.cli import load_config
 from nerfdiff.distill.distillation import Distillation
 from nerfdiff.distill.field_file import FIELD, load_field
+from nerfdiff.distill.priors.sphere import Sphere
 from nerfdiff.errors import ConfigError, DataError, TimeUp
-from nerfdiff.evaluation.distill import distill
-from nerfdiff.evaluation.subject import dataset_subject
+from nerfdiff.evaluation.distill import _warn_of_inert, distill
+from nerfdiff.evaluation.subject import dataset_subject, picture_subject
 from nerfdiff.metrics.predictions import read_prediction
+from nerfdiff.metrics.score import Scorer
 from nerfdiff.modules.ngd_module import NGDModule
 from nerfdiff.results.row import read_rows
+from nerfdiff.stopping import Stopped, on_signals, stop
 from training_fixtures import SRC, environment, evaluation_overrides, train_to_evaluate, write_dataset
 
 STEPS = 3
@@ -95,6 +102,50 @@ def test_every_scene_leaves_its_field_views_orbit_and_trace(strategy, data, run,
     assert next(tmp_path.glob(f"{strategy}-*/sheet.png")).stat().st_size > 1000
 
 
+def test_k_is_the_number_of_views_that_fields_were_fitted_to(data, run, tmp_path, caplog):
+    """Π of the scene's own views: the input view and 4 others, or 2 by eval_stride, whatever is asked for."""
+    small = "sheet.scenes=0", "orbit.frames=0", "budget.inner_steps=1", "budget.steps=2"
+    for stride, asked, used in ((1, 4, 4), (1, 9, 5), (2, 9, 3)):
+        settings = "prior=abo_views", f"budget.views={asked}", f"data.eval_stride={stride}", *small
+        row = distill(config(data, run, tmp_path, *settings))
+        assert (row.K, row.prior) == (used, "OwnViews")
+        assert row.denoiser_calls == 2 * 2 * used  # scenes, steps
+        assert (f"{used} virtual views instead of the {asked}" in caplog.text) == (used < asked)
+    none = distill(config(data, run, tmp_path, "strategy=none", *small))
+    assert none.K is none.prior is None
+
+
+def test_scenes_with_different_numbers_of_views_are_told(data, run, tmp_path, monkeypatch, caplog):
+    """The row's K is the most; a prior needs nothing but to be called."""
+
+    class Odd:
+        def __call__(self, scene):
+            return Sphere(2 if scene.scene_ids[0] == "scene0" else 3, (0.0, 20.0), (-90.0, 90.0), 20.0)(scene)
+
+    cfg = config(data, run, tmp_path, "sheet.scenes=0", "orbit.frames=0")
+    monkeypatch.setattr(
+        "nerfdiff.evaluation.distill._strategy",
+        lambda cfg: dataclasses.replace(instantiate(cfg.strategy, _convert_="all"), prior=Odd()),
+    )
+    row = distill(cfg)
+    assert (row.K, row.prior) == (3, "Odd") and "scenes had 2 to 3 virtual views" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["image=car.png", "prior=abo_views", "+data.eval_stride=2"],
+            "prior=abo_views, +data.eval_stride=2 cannot act",
+        ),
+        (["image=car.png", "picture_views.views=3", "prior_of_mine=1"], None),
+    ],
+)
+def test_what_cannot_act_on_a_picture_is_said(words, said, caplog):
+    _warn_of_inert(words)
+    assert caplog.text == "" if said is None else said in caplog.text
+
+
 @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
 def test_the_field_in_the_file_is_the_one_whose_views_were_saved(precision, data, run, tmp_path):
     cfg = config(data, run, tmp_path, f"precision={precision}", "strategy.lr_decoder=1e-2")
@@ -122,6 +173,50 @@ def test_scenes_that_are_done_are_not_made_again(data, run, tmp_path, monkeypatc
         distill(config(data, run, tmp_path))
     row = distill(config(data, run, tmp_path))
     assert calls == ["scene0", "scene1", "scene1"] and row.n_scenes == 2
+
+
+def test_a_stopped_distillation_says_what_is_saved(data, run, tmp_path, monkeypatch):
+    """Within the second scene, and within Lightning's own handling of signals; no failed row."""
+    step, seen = NGDModule.training_step, []
+
+    def stopped(self, *arguments):
+        seen.append(self.views[0].seed[-1])
+        if len(seen) == STEPS + 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return step(self, *arguments)
+
+    monkeypatch.setattr(NGDModule, "training_step", stopped)
+    with pytest.raises(Stopped, match=r"1 of 2 scenes of ngd are saved in .*predictions/ngd") as end, on_signals(stop):
+        distill(config(data, run, tmp_path))
+    assert end.value.status == 143 and not (tmp_path / "results.jsonl").exists()
+    row = distill(config(data, run, tmp_path))
+    assert row.n_scenes == 2 and seen == ["scene0"] * STEPS + ["scene1"] * (2 + STEPS)
+
+
+def test_of_two_runs_side_by_side_one_appends_the_row(data, run, tmp_path, monkeypatch):
+    """The second begins and ends while the first scores; a run after both has a row of its own."""
+    score, nested = Scorer.score, []
+
+    def score_while_another_runs(self, *arguments):
+        if not nested:
+            nested.append(True)
+            nested.append(distill(config(data, run, tmp_path)))
+        return score(self, *arguments)
+
+    monkeypatch.setattr(Scorer, "score", score_while_another_runs)
+    row = distill(config(data, run, tmp_path))
+    assert row.run_id == nested[1].run_id and len(read_rows(tmp_path / "results.jsonl")) == 1
+    distill(config(data, run, tmp_path))
+    assert len(read_rows(tmp_path / "results.jsonl")) == 2
+
+
+def test_a_distillation_says_how_far_it_is(data, run, tmp_path, caplog):
+    caplog.set_level("INFO")
+    distill(config(data, run, tmp_path, "progress_every=1e-9"))
+    lines = [record.message for record in caplog.records if record.name == "nerfdiff.evaluation.progress"]
+    assert re.fullmatch(r"ngd: scene 1 of 2, step 1 of 3, t 1\.00, renders against targets .* dB, .* left", lines[0])
+    assert re.fullmatch(r"ngd: scene 2 of 2, step 3 of 3, .* left|ngd: scene 2 of 2, step 3 of 3, .* dB", lines[-2])
+    assert re.fullmatch(r"ngd: scene 2 of 2, PSNR [\d.]+", lines[-1]) and len(lines) == 2 * (STEPS + 1)
 
 
 def test_scenes_fitted_together_are_what_they_are_alone(data, run, tmp_path):
@@ -208,6 +303,14 @@ def picture(tmp_path):
     return path
 
 
+def test_equal_pictures_of_several_names_are_scenes_of_their_own(data, run, tmp_path, picture):
+    other = picture.with_name("a=b, c (1).png")
+    shutil.copy(picture, other)
+    configs = [config(data, run, tmp_path, f"image={path}") for path in (picture, other)]
+    first, second = (picture_subject(cfg, torch.device("cpu")) for cfg in configs)
+    assert (first.scene_ids, second.scene_ids) == (["red_car"], ["a_b_c_1"]) and first.folder != second.folder
+
+
 @pytest.mark.parametrize("strategy", ["none", "cdm", "ngd"])
 def test_one_picture_becomes_a_scene(strategy, data, run, tmp_path, picture):
     out = tmp_path / "out"
@@ -259,6 +362,25 @@ def test_no_method_sees_the_truth(strategy, data, run, tmp_path):
     other = dataclasses.replace(scene, target_pixels=255 - scene.target_pixels, target_depth=None, target_mask=None)
     first, second = (instantiate(cfg.strategy).predict(subject.model, [batch], 0)[0] for batch in (scene, other))
     assert torch.equal(first.images, second.images)
+
+
+def test_a_process_that_dies_ends_the_run_with_a_sentence(data, run, tmp_path):
+    """The other finishes its scene first; the row of the failed run says why."""
+    out = tmp_path / "out"
+    more = ["processes=2", "budget.steps=30", "budget.sampler_steps=30", f"paths.run_dir={out}", "progress_every=0.1"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": environment()}
+    process = subprocess.Popen([sys.executable, str(SRC / "distill.py"), *overrides(data, run, out, *more)], **pipes)
+    for line in process.stdout:
+        if "step 1 of" in line:
+            (other,) = psutil.Process(process.pid).children()
+            other.kill()
+            break
+    _, said = process.communicate(timeout=300)
+    assert process.returncode == 1 and "Traceback" not in said, said
+    sentence = "Process 1 of 2 was ended by SIGKILL. 1 of 2 scenes of ngd are saved in "
+    assert said.strip().splitlines()[-1].startswith(f"error: {sentence}")
+    (row,) = read_rows(out / "results.jsonl")
+    assert row.status == "error" and row.error.startswith(sentence)
 
 
 def test_a_process_that_fails_ends_the_run_with_its_words(data, run, tmp_path):

@@ -1,4 +1,6 @@
 import json
+import os
+import shutil
 
 import pytest
 import torch
@@ -97,8 +99,22 @@ def test_copying_the_input_scores_what_the_files_say(data, run, tmp_path):
     scenes = []
     for scene in sorted((data / "cars_test").iterdir()):
         views = [np.asarray(Image.open(p), float) / 255 for p in sorted((scene / "rgb").iterdir())]
-        scenes.append(np.mean([-10 * np.log10(np.mean((view - views[0]) ** 2) + 1e-6) for view in views[1:]]))
+        scenes.append(np.mean([-10 * np.log10(max(np.mean((view - views[0]) ** 2), 1e-6)) for view in views[1:]]))
     assert rows[1].psnr == pytest.approx(np.mean(scenes), abs=1e-4)
+
+
+@pytest.mark.parametrize("left", ["nothing", "an empty folder"])
+def test_a_test_split_alone_is_evaluated_without_the_mean_image(data, run, tmp_path, caplog, left):
+    shutil.copytree(data / "cars_test", tmp_path / "data" / "cars_test")
+    if left == "an empty folder":
+        (tmp_path / "data" / "cars_train").mkdir()
+    settings = "orbit.scenes=0", "metrics.st_lpips=false"
+    rows = evaluate(config(tmp_path / "data", run, tmp_path / "out", *settings))
+    assert [row.strategy for row in rows] == ["none", "copy_input"] and all(row.status == "ok" for row in rows)
+    assert sum("mean_image is left out" in message and "train" in message for message in caplog.messages) == 1
+    (tmp_path / "data" / "cars_train" / "scene0").mkdir(parents=True)  # a damaged one is no missing one
+    with pytest.raises(DataError, match=r"scene0/rgb: no such folder"):
+        evaluate(config(tmp_path / "data", run, tmp_path / "out", *settings))
 
 
 def test_the_same_evaluation_predicts_nothing_twice(data, run, tmp_path, monkeypatch):
@@ -159,8 +175,6 @@ def test_a_failure_is_a_row(data, run, tmp_path, monkeypatch):
 
 
 def test_an_all_white_scene_is_finite_and_reported(data, run, tmp_path):
-    import shutil
-
     from PIL import Image
 
     shutil.copytree(data, tmp_path / "data", ignore=shutil.ignore_patterns("cache"))
@@ -200,7 +214,10 @@ def test_what_this_machine_cannot_do_is_said(data, run, tmp_path, setting, word)
 
 
 def test_weights_can_be_shared_at_half_the_size(run, tmp_path):
+    umask = os.umask(0o027)
     whole = export(str(run), "ema", tmp_path / "whole", "float32", tmp_path)
+    os.umask(umask)
+    assert [path.stat().st_mode & 0o777 for path in whole.parent.iterdir()] == [0o640, 0o640]
     half = export(str(run), "ema", tmp_path / "half", "float16", tmp_path)
     assert half.stat().st_size < 0.6 * whole.stat().st_size
     first, second = (load_model(path.parent, "ema", tmp_path).model.state_dict() for path in (whole, half))

@@ -39,7 +39,12 @@ def test_images_need_not_be_square():
     assert encoding.triplane.planes.shape == (2, 3, 8, 12, 20)
     assert rendering.rgb.shape == (2, 1, 12, 20, 3)
     z = torch.randn(2, 3, 12, 20)
-    assert net.denoiser(z, torch.full((2,), 0.3), net.condition(encoding, cameras[:, None], rendering.rgb.movedim(-1, 2))).shape == z.shape
+    assert (
+        net.denoiser(
+            z, torch.full((2,), 0.3), net.condition(encoding, cameras[:, None], rendering.rgb.movedim(-1, 2))
+        ).shape
+        == z.shape
+    )
 
 
 def test_scenes_of_a_batch_do_not_mix():

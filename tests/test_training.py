@@ -1,4 +1,3 @@
-import os
 import re
 import resource
 import signal
@@ -12,7 +11,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import api_pb2, metadata
 
-from nerfdiff import training
 from nerfdiff.checkpoint import load_model
 from nerfdiff.errors import CheckpointError, ConfigError, DataError
 from training_fixtures import (
@@ -22,6 +20,7 @@ from training_fixtures import (
     last_checkpoint,
     run_command,
     run_training,
+    train_with,
     write_dataset,
 )
 
@@ -36,31 +35,6 @@ def whole(data, tmp_path_factory):
     """An uninterrupted run."""
     run = tmp_path_factory.mktemp("whole")
     return run, run_training(data, run)
-
-
-class StopAt(Callback):
-    """Sends this process SIGTERM at the end of a batch, as a scheduler would."""
-
-    def __init__(self, batch: int):
-        self.batch = batch
-
-    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
-        if batch_idx == self.batch:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-
-def train_with(monkeypatch, callback, data, run, *more):
-    """One run with one more callback, before the checkpoints'."""
-    build = training.instantiate
-
-    def instantiate(config, **options):
-        if "callbacks" in options:
-            options["callbacks"] = [callback, *options["callbacks"]]
-        return build(config, **options)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(training, "instantiate", instantiate)
-        return run_training(data, run, *more)
 
 
 def test_a_run_leaves_what_a_person_looks_for(whole):
@@ -112,19 +86,6 @@ def test_training_lowers_the_loss(data, tmp_path):
     assert longer["val/loss_dm"] < 0.9 * short["val/loss_dm"]
 
 
-@pytest.mark.parametrize(("accumulate", "batch"), [(1, 2), (2, 4), (2, 5)])
-def test_sigterm_then_the_same_command_ends_as_if_nothing_happened(data, tmp_path, monkeypatch, accumulate, batch):
-    """Stopped between steps (batch 5 of windows of two) and within one (batch 4)."""
-    more = f"trainer.accumulate_grad_batches={accumulate}"
-    run_training(data, tmp_path / "whole", more)
-    with pytest.raises(SystemExit):
-        train_with(monkeypatch, StopAt(batch), data, tmp_path / "stopped", more)
-    step = last_checkpoint(tmp_path / "stopped")["global_step"]
-    assert step == (batch + 1) // accumulate
-    run_training(data, tmp_path / "stopped", more)
-    assert_same_state(last_checkpoint(tmp_path / "whole"), last_checkpoint(tmp_path / "stopped"))
-
-
 def test_kill_9_then_the_same_command_ends_as_if_nothing_happened(data, tmp_path):
     steps = ["trainer.max_steps=30", "validation_every=1000", "callbacks.last.every_n_steps=1"]
     last = tmp_path / "killed" / "checkpoints" / "last.ckpt"
@@ -169,8 +130,21 @@ def test_accumulated_batches_give_the_gradients_of_one(data, tmp_path, whole):
     assert differing(one, two) < 1e-3
 
 
-def test_two_processes_train_what_one_does(data, tmp_path, whole):
+def test_two_processes_train_what_one_does_also_when_they_are_stopped(data, tmp_path, whole):
+    """The scheduler's signal reaches the first of them, which has them all stop after the same step."""
     more = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "trainer.precision=32-true"]
+    progress = "{_target_: nerfdiff.callbacks.progress.TrainingProgress, every_steps: 1, every_seconds: 60}"
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": environment()}
+    process = subprocess.Popen(command(data, tmp_path, *more, f"callbacks.progress={progress}"), **pipes)
+    for line in process.stdout:
+        if "step 1 of 6, loss" in line:
+            process.send_signal(signal.SIGTERM)
+            break
+    _, said = process.communicate(timeout=300)
+    step = last_checkpoint(tmp_path)["global_step"]
+    assert process.returncode == 143 and 0 < step < 6, said
+    assert said.count("stopped by SIGTERM") == said.count(f"stopped by SIGTERM. Step {step} is saved in ") == 1
+    assert "Traceback" not in said
     run_command(data, tmp_path, *more)
     one, two = last_checkpoint(whole[0]), last_checkpoint(tmp_path)
     assert two["global_step"] == one["global_step"]
@@ -207,7 +181,7 @@ def test_memory_settings_may_change_on_resuming_but_accumulation_may_not(data, t
     run_training(data, tmp_path, "trainer.max_steps=2")
     with pytest.raises(CheckpointError, match="accumulate_grad_batches: 1 → 2"):
         run_training(data, tmp_path, "trainer.accumulate_grad_batches=2")
-    run_training(data, tmp_path, "trainer.max_steps=4", "model.render.chunk=100", "model.unet.checkpointing=true")
+    run_training(data, tmp_path, "trainer.max_steps=4", "model.render.chunk=1024", "model.unet.checkpointing=true")
     assert last_checkpoint(tmp_path)["global_step"] == 4
 
 

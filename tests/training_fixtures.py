@@ -6,8 +6,10 @@ import sys
 from pathlib import Path
 
 import torch
+from lightning import Callback
 
 from data_fixtures import write_scene
+from nerfdiff import training
 from nerfdiff.cli import load_config
 from nerfdiff.training import train
 
@@ -57,6 +59,20 @@ def overrides(data: Path, run: Path, *more: str) -> list[str]:
 def run_training(data: Path, run: Path, *more: str) -> dict[str, float]:
     """Train in this process."""
     return train(load_config("train", overrides(data, run, f"paths.output_dir={run}", *more)))
+
+
+def train_with(monkeypatch, callback: Callback, data: Path, run: Path, *more: str) -> dict[str, float]:
+    """One run with one more callback, before the checkpoints'."""
+    build = training.instantiate
+
+    def instantiate(config, **options):
+        if "callbacks" in options:
+            options["callbacks"] = [callback, *options["callbacks"]]
+        return build(config, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "instantiate", instantiate)
+        return run_training(data, run, *more)
 
 
 def command(data: Path, run: Path, *more: str) -> list[str]:

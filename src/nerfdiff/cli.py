@@ -3,9 +3,11 @@
 import difflib
 import functools
 import os
+import re
+import shlex
 import sys
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import hydra
 from hydra import compose, initialize_config_dir
@@ -19,9 +21,13 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nerfdiff.cpu_memory import keep_freed_memory
-from nerfdiff.errors import ConfigError, UserError
-
-CONF = Path(__file__).parents[2] / "conf"
+from nerfdiff.errors import ConfigError, UserError, is_out_of_memory
+from nerfdiff.inputs import CHECKOUT, CONF, check_inputs, check_output
+from nerfdiff.limits import check_limit, check_limits
+from nerfdiff.noise import quieten
+from nerfdiff.quoting import parse_override, quote_values
+from nerfdiff.results.hashes import sha256_values
+from nerfdiff.stopping import Stopped, leave, on_signals, stop
 
 # What a value must be, by the type of its default.
 KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
@@ -38,23 +44,37 @@ EITHER: dict[str, tuple[type, ...]] = {
     "checkpointing": (bool, list, str),  # everywhere or nowhere, at some resolutions, or auto
 }
 OPTIONAL_GROUPS = ("logger", "experiment", "sweep")
+MULTIRUN = ("-m", "--multirun")
+# Options with which a command shows something and runs nothing, or runs another config.
+SHOWING = ("-h", "--help", "--hydra-help", "--version", "-c", "--cfg", "-i", "--info")
+OTHER_CONFIG = ("-cp", "--config-path", "-cn", "--config-name", "-cd", "--config-dir", "--experimental-rerun")
+COMPLETING = ("-sc", "--shell-completion")
+EXCLUDED = "hydra.job.config.override_dirname.exclude_keys"
+MAX_FOLDER = 100
+"""Characters of the name of a sweep's job before its hash; file systems take 255 bytes."""
 
 
-def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], object]], Callable[[], None]]:
+def entry_point(config_name: str, *inputs: str) -> Callable[[Callable[[DictConfig], object]], Callable[[], None]]:
     """Make a function of a config into a command.
 
-    Overrides are checked against the composed defaults: an unknown key or a value of the wrong kind ends the
-    command with the keys that exist. What `explain` knows ends it with one line and exit status 1;
-    HYDRA_FULL_ERROR=1 gives the traceback instead.
+    Values that Hydra's grammar would misread are quoted for it. Overrides are checked against the composed defaults:
+    an unknown key or a value of the wrong kind ends the command with the keys that exist, and so does a checkpoint,
+    picture or folder that is not there, before anything slow is imported. What `explain` knows ends it with one line
+    and exit status 1; HYDRA_FULL_ERROR=1 gives the traceback instead.
+
+    Args:
+        config_name: of the file in conf/.
+        inputs: keys of what the command reads, see `check_inputs`.
     """
 
     def decorate(function: Callable[[DictConfig], object]) -> Callable[[], None]:
         @functools.wraps(function)
         def run(cfg: DictConfig) -> object:
+            quieten()
             try:
                 return function(cfg)
             except Exception as error:
-                message = explain(error)
+                message = explain(error, cfg)
                 if message is None or os.environ.get("HYDRA_FULL_ERROR") == "1":
                     raise
                 if HydraConfig.get().mode == RunMode.MULTIRUN:
@@ -67,23 +87,56 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], object]], 
         @functools.wraps(function)
         def main() -> None:
             try:
-                check_overrides(config_name, sys.argv[1:])
-            except ConfigError as error:
+                sys.argv[1:] = prepare_arguments(config_name, inputs, sys.argv[1:])
+            except UserError as error:
                 sys.exit(f"error: {error}")
             keep_freed_memory()
             command()
 
-        return main
+        @functools.wraps(function)
+        def stoppable() -> None:
+            words = shlex.join([*command_words(config_name), *sys.argv[1:]])
+            try:
+                with on_signals(stop):
+                    main()
+            except Stopped as stopped:
+                leave(stopped, words)
+
+        return stoppable
 
     return decorate
 
 
-def explain(error: BaseException) -> str | None:
-    """The line that tells a person what to mend; None for errors that are no `UserError` and not of the config.
+def command_words(name: str) -> list[str]:
+    """The shell command of an entry point: from the project's folder, or as it is installed."""
+    return ["python", f"src/{name}.py"] if CHECKOUT else [f"nerfdiff-{name.replace('_', '-')}"]
+
+
+def job_folder(swept: str, overrides: Sequence[str] = ()) -> str:
+    """The name of the folder of a sweep's job, which every file system takes and which may stand in an override.
+
+    Args:
+        swept: the overrides that tell the sweep's jobs apart; they name it.
+        overrides: others that the hash at the name's end is of as well.
+    """
+    name = re.sub(r"[^a-zA-Z0-9_.]+", "-", swept)[:MAX_FOLDER].strip("-.")
+    return "-".join(filter(None, [name, sha256_values([swept, *sorted(overrides)])[:8]]))
+
+
+OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
+
+
+def explain(error: BaseException, cfg: DictConfig | None = None) -> str | None:
+    """The line that tells a person what to mend; None for errors that nobody but a developer can mend.
 
     Finds a `UserError` behind Hydra's `instantiate` and behind the traceback with which PyTorch's DataLoader hands
-    on what a worker raised.
+    on what a worker raised. Files and memory that the system refuses are a person's to mend, too.
+
+    Args:
+        cfg: of the command, of which memory's advice names the keys.
     """
+    if not isinstance(error, UserError) and (refused := _refused(error, cfg)):
+        return refused
     if not isinstance(error, (UserError, InstantiationException, OmegaConfBaseException)):
         return None
     chain = [error]
@@ -103,14 +156,85 @@ def explain(error: BaseException) -> str | None:
     return _one_line(f"{key}: " if key else "", target, cause)
 
 
+def _refused(error: BaseException, cfg: DictConfig | None) -> str | None:
+    """What the system would not give: a file, or memory."""
+    if is_out_of_memory(error):
+        known = ("data.batch_size", "budget.rays", "budget.views", "strategy.views_at_once", "scenes_at_once", "chunk")
+        keys = [key for key in known if cfg is not None and OmegaConf.select(cfg, key, default=None) is not None]
+        lower = f": lower {', '.join(keys)}" if keys else ""
+        return _one_line("memory ran out", f"({str(error).splitlines()[0][:200]})" if str(error) else "") + lower
+    if isinstance(error, OSError):
+        what = error.strerror or _last_line(error) or type(error).__name__
+        return _one_line(f"{error.filename}: " if error.filename else "", what)
+    if isinstance(error, RuntimeError) and "Symlink loop" in str(error):  # pathlib's
+        return _last_line(error)
+    return None
+
+
+def _last_line(error: BaseException) -> str:
+    """Of what it says: where a DataLoader's worker raised it, the lines before are a traceback."""
+    return (str(error).strip().splitlines() or [""])[-1]
+
+
 def load_config(config_name: str, overrides: list[str]) -> DictConfig:
     """The composed config of an entry point, as its command would see it (without Hydra's own node).
 
     Raises:
-        ConfigError: an override names no key, or its value is of the wrong kind.
+        ConfigError: an override names no key, or its value is of the wrong kind, or a number that no run can have.
     """
+    overrides = quote_values(overrides)
     check_overrides(config_name, overrides)
-    return _compose(config_name, overrides)
+    config = _compose(config_name, overrides)
+    check_limits(config)
+    return config
+
+
+def prepare_arguments(config_name: str, inputs: Sequence[str], arguments: list[str]) -> list[str]:
+    """A command's arguments as Hydra is to read them, after they were checked.
+
+    Raises:
+        UserError: they are wrong, or a file or folder that they name is not there.
+    """
+    options = {word.partition("=")[0] for word in arguments if word.startswith("-")}
+    if not options.isdisjoint(COMPLETING):
+        return arguments
+    arguments = quote_values(arguments)
+    check_overrides(config_name, arguments)
+    if not options.isdisjoint((*SHOWING, *OTHER_CONFIG)):
+        return arguments
+    overrides = _overrides(arguments)
+    swept = {override.key_or_group for override in overrides if override.is_sweep_override()}
+    fixed = {override.key_or_group: override for override in overrides if override.key_or_group not in swept}
+    words = [_choices(override)[0].input_line for override in overrides if _is_group(override)]
+    words += [override.input_line for override in fixed.values() if not _is_group(override)]
+    config = _compose(config_name, words, with_hydra=True)
+    if options.isdisjoint(MULTIRUN) and config.hydra.mode != RunMode.MULTIRUN:
+        check_limits(config)
+        check_inputs(config, inputs)
+        check_output(config)
+        return arguments
+    check_inputs(config, inputs, swept=swept | set(config.hydra.sweeper.get("params") or ()), only=fixed)
+    # jobs, in whatever process, are to name their folders by what is swept
+    untold = [key for key, override in fixed.items() if not override.is_hydra_override()]
+    return [*arguments, f"{EXCLUDED}=[{','.join(untold)}]"]
+
+
+def _overrides(arguments: list[str]) -> list[Override]:
+    """The `key=value` words among a command's arguments.
+
+    Raises:
+        ConfigError: Hydra cannot read one, or a word is none.
+    """
+    for before, word in pairwise(["", *arguments]):
+        if not word.startswith(("-", "~")) and "=" not in word and not before.startswith("-"):
+            raise ConfigError(f"{word} says no key: write key={word}, without spaces around =")
+    words = [word for word in arguments if not word.startswith("-") and "=" in word.lstrip("~+")]
+    for word in words:
+        if parse_override(word) is None:
+            key, _, value = word.partition("=")
+            quoted = shlex.quote(f'{key}="{value}"')
+            raise ConfigError(f"cannot read the override {word}; if its value is text, quote all of it: {quoted}")
+    return OverridesParser.create().parse_overrides(words)
 
 
 def check_overrides(config_name: str, arguments: list[str]) -> None:
@@ -119,12 +243,7 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
     Raises:
         ConfigError: see `load_config`.
     """
-    words = [word for word in arguments if not word.startswith("-") and "=" in word.lstrip("~+")]
-    try:
-        overrides = OverridesParser.create().parse_overrides(words)
-    except HydraException as error:
-        raise ConfigError(f"cannot read the overrides {' '.join(words)}: {str(error).splitlines()[0]}") from error
-    choices = [_choices(override) for override in overrides]
+    choices = [_choices(override) for override in _overrides(arguments)]
     groups = [alternatives for alternatives in choices if _is_group(alternatives[0])]
     configs = _compose_each(config_name, groups)
     for override in (choice for alternatives in choices for choice in alternatives):
@@ -222,6 +341,8 @@ def _check_kind(default: object, override: Override) -> None:
     """A number stays a number and a list a list; null, strings and interpolations say nothing of their kind."""
     value = override.value()
     interpolated = isinstance(value, str) and "${" in value
+    if not isinstance(value, str):
+        check_limit(override.key_or_group, value)
     if type(default) not in KINDS or value is None or interpolated or override.is_sweep_override():
         return
     if isinstance(value, EITHER.get(override.key_or_group.rpartition(".")[2], ())):

@@ -1,5 +1,6 @@
 """The demonstration: scenes, training, evaluation and distillation in one go, each the same as its own command."""
 
+import os
 import shlex
 import subprocess
 import sys
@@ -8,15 +9,15 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 from rich.console import Console
+from rich.markup import escape
 from rich.rule import Rule
 
-from nerfdiff.cli import load_config
+from nerfdiff.cli import command_words, load_config
 from nerfdiff.errors import UserError
 from nerfdiff.evaluation.evaluate import evaluate
+from nerfdiff.inputs import PACKAGE
 from nerfdiff.scenes.generate import make_scenes
 from nerfdiff.training import train
-
-COMMANDS = Path(__file__).parents[1]
 
 
 def demo(cfg: DictConfig) -> None:
@@ -30,7 +31,8 @@ def demo(cfg: DictConfig) -> None:
     console, started, run = Console(), time.perf_counter(), Path(cfg.run)
 
     def announce(command: str, overrides: list[str]) -> list[str]:
-        console.print(Rule(f"python src/{command}.py"), f"[dim]{shlex.join(overrides)}[/dim]", soft_wrap=True)
+        command_line = Rule(escape(" ".join(command_words(command))))
+        console.print(command_line, f"[dim]{escape(shlex.join(overrides))}[/dim]", soft_wrap=True)
         return overrides
 
     def prepare(command: str, overrides: list[str]) -> DictConfig:
@@ -42,10 +44,15 @@ def demo(cfg: DictConfig) -> None:
     evaluate(prepare("evaluate", [*cfg.evaluate, *trained, f"paths.output_dir={run / 'evaluation'}"]))
     # a sweep is Hydra's to run: a process of its own
     overrides = announce("distill", [*cfg.distill, *trained, f"hydra.sweep.dir={run / 'distillation'}"])
-    if subprocess.run([sys.executable, COMMANDS / "distill.py", *overrides]).returncode != 0:
+    paths = [str(PACKAGE.parent), os.environ.get("PYTHONPATH")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    command = [sys.executable, "-m", "nerfdiff.commands.distill", *overrides]
+    if subprocess.run(command, env=environment).returncode != 0:
         raise UserError("the distillation failed; see above")
 
     pictures = [run / "distillation" / name for name in ("grid.png", "orbits.mp4", "table.md")]
     pictures += sorted((run / "evaluation").glob("*/sheet.png"))
-    console.print("Open:", *(f"  {path}" for path in pictures if path.exists()), f"  {run / 'previews'}", sep="\n")
+    console.print(
+        "Open:", *(f"  {path}" for path in pictures if path.exists()), f"  {run / 'previews'}", sep="\n", markup=False
+    )
     console.print(f"{(time.perf_counter() - started) / 60:.1f} minutes")

@@ -1,5 +1,6 @@
 """The errors a person can mend: each message names what failed, what was expected and what to do."""
 
+import math
 from collections.abc import Collection
 
 
@@ -23,8 +24,33 @@ class TrainingDiverged(UserError, RuntimeError):
     """Losses or gradients stayed non-finite for too many steps in a row."""
 
 
+class BusyError(UserError, RuntimeError):
+    """Another process works in the same folder."""
+
+
+class ProcessLost(UserError, RuntimeError):
+    """One of the processes that share a run died."""
+
+
+class OutOfMemory(UserError, MemoryError):
+    """What was asked for takes more memory than the device has free."""
+
+
 class TimeUp(UserError):
     """A run ended because the minutes it may take were spent, with work left to do."""
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether a device's memory ran out; PyTorch says so of a CPU's in words only."""
+    words = "can't allocate memory", "not enough memory", "CUDA out of memory"
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(w in str(error) for w in words))
+
+
+def size_text(count: float) -> str:
+    """Bytes as a person reads them: `512 bytes`, `3.4 MB`."""
+    power = min(4, int(math.log10(max(count, 1)) / 3))
+    value, unit = count / 1000**power, ("bytes", "kB", "MB", "GB", "TB")[power]
+    return f"{value:.0f} {unit}" if power == 0 or value >= 100 else f"{value:.3g} {unit}"
 
 
 def some(names: Collection[str], limit: int = 8) -> str:

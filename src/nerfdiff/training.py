@@ -1,6 +1,8 @@
 """One training run, from a composed config to a model on disk."""
 
 import logging
+import os
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,15 +14,31 @@ from lightning import Trainer, seed_everything
 from omegaconf import DictConfig, OmegaConf
 
 from nerfdiff.callbacks.checkpoint import ClearCheckpointIO
-from nerfdiff.checkpoint import check_resumable, export_model, last_checkpoint, load_model
+from nerfdiff.callbacks.record import Record
+from nerfdiff.checkpoint import (
+    DAMAGED,
+    check_finite,
+    check_resumable,
+    check_same_data,
+    describe,
+    differences,
+    export_model,
+    last_checkpoint,
+    load_model,
+    read_checkpoint,
+)
 from nerfdiff.compilation import compile_unets
 from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.diffusion.layout import channels_last
 from nerfdiff.diffusion.unet import AUTO
-from nerfdiff.errors import CheckpointError, ConfigError
+from nerfdiff.errors import CheckpointError, ConfigError, ProcessLost, TrainingDiverged
+from nerfdiff.inputs import LAST, find_weights
 from nerfdiff.memory import WEIGHTS_ADAM_EMA, is_tight, within_memory
 from nerfdiff.modules.nerfdiff_module import NerfDiffModule
+from nerfdiff.processes import lost_process, watch
+from nerfdiff.results.files import held, remove_leftovers
 from nerfdiff.results.hashes import sha256_file, sha256_values
+from nerfdiff.stopping import Stopped
 
 log = logging.getLogger(__name__)
 
@@ -37,17 +55,25 @@ def train(cfg: DictConfig) -> dict[str, float]:
     Raises:
         UserError: bad data, config, checkpoint, or a run that diverged; the message says what to do.
     """
+    watch()
     # Seeds the initial weights, and dropout where a model has it. All other randomness is a function of cfg.seed and
     # the draw (nerfdiff.randomness), which a resumed run takes up where it was.
     seed_everything(cfg.seed, verbose=False)
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
-    output_dir = Path(cfg.paths.output_dir)
-    model_config = plain(cfg.model) | {"conditioning": plain(cfg.conditioning)}
-    last = _checkpoint_to_resume(output_dir, cfg, model_config)
-
     trainer = build_trainer(cfg)
+    with held(Path(cfg.paths.output_dir)) if trainer.is_global_zero else nullcontext():
+        return _train(cfg, trainer)
+
+
+def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
+    output_dir = Path(cfg.paths.output_dir)
+    if trainer.is_global_zero:
+        for folder in (output_dir, *(output_dir / name for name in ("checkpoints", "model", "previews", "snapshots"))):
+            remove_leftovers(folder)
+    model_config = plain(cfg.model) | {"conditioning": plain(cfg.conditioning)}
     datamodule = instantiate(cfg.data)
+    last = _checkpoint_to_resume(output_dir, cfg, model_config, datamodule)
     model_config = _within_memory(model_config, trainer, datamodule)
     module = NerfDiffModule(
         model=model_config,
@@ -58,16 +84,24 @@ def train(cfg: DictConfig) -> dict[str, float]:
         seed=cfg.seed,
         kept_renderings=_kept_renderings(cfg, datamodule),
     )
-    if cfg.init is not None and last is None:
-        module.model.load_state_dict(load_model(cfg.init, "ema", cfg.paths.assets_dir).model.state_dict())
+    if last is None:
+        _begin(module, cfg, model_config)
     module.model.renderer = replace(module.model.renderer, backend=cfg.backend, kernel_precision=cfg.kernel_precision)
     compile_unets(module.model, cfg.compile, cfg.paths.compiled_dir)
-    if trainer.is_global_zero:
-        output_dir.mkdir(parents=True, exist_ok=True)
-        OmegaConf.save(cfg, output_dir / "config.yaml", resolve=True)
-    _announce(module, last)
+    _announce(module, last, trainer.strategy.root_device)
+    if trainer.is_global_zero and last is not None and last.name != LAST and (last.parent / LAST).exists():
+        os.replace(last.parent / LAST, last.parent / DAMAGED)  # else it would take the place of the one that is good
 
-    trainer.fit(module, datamodule, ckpt_path=last, weights_only=True)
+    try:
+        trainer.fit(module, datamodule, ckpt_path=last, weights_only=True)
+    except Stopped as stopped:
+        raise Stopped(stopped.signum, describe(last_checkpoint(output_dir))) from None
+    except TrainingDiverged as error:
+        raise TrainingDiverged(f"{error}. {_sound(output_dir)}") from error
+    except RuntimeError as error:
+        if trainer.world_size == 1 or not (sentence := lost_process(error)):
+            raise
+        raise ProcessLost(f"{sentence} {describe(last_checkpoint(output_dir))} The same command goes on") from error
 
     if trainer.is_global_zero:
         # From the file, not the module: resuming a run that is complete leaves raw weights in the module.
@@ -79,14 +113,32 @@ def train(cfg: DictConfig) -> dict[str, float]:
     return {name: float(value) for name, value in trainer.callback_metrics.items()}
 
 
+def _begin(module: NerfDiffModule, cfg: DictConfig, model_config: dict) -> None:
+    """Give a new run the weights of `cfg.init`."""
+    if cfg.init is None:
+        if module.frozen_field:
+            raise ConfigError("losses.lambda_ic=0 trains the CDM on a field that stays as it is: set init=<checkpoint>")
+        return
+    begun = load_model(cfg.init, "ema", cfg.paths.assets_dir)
+    try:
+        module.model.load_state_dict(begun.model.state_dict())
+    except RuntimeError as error:  # of other names or sizes
+        changed = "; ".join(differences(begun.config, model_config, "model."))
+        raise CheckpointError(f"init={cfg.init} does not fit this run's model ({changed}): use its settings") from error
+    module.trained_before, module.begun_from = list(begun.trained_on), sha256_file(begun.path)
+
+
 def _kept_renderings(cfg: DictConfig, data: SceneDataModule) -> str | None:
-    """The folder of a frozen field's renderings: its name says which field sees which data."""
+    """The folder for a frozen field's renderings: its name says how which data are rendered."""
     if not cfg.kept_renderings:
         return None
-    if cfg.init is None:
-        raise ConfigError("kept_renderings are of the field that init=<checkpoint> brings: set init, or it to null")
-    reader, init = data.reader("train"), load_model(cfg.init, "ema", cfg.paths.assets_dir)
-    what = [sha256_file(init.path), plain(cfg.model.render), reader.identity, reader.fingerprint()]
+    if data.source_target_noise:
+        raise ConfigError(
+            f"kept_renderings are of the views' own cameras, and data.source_target_noise={data.source_target_noise} "
+            "moves some of these at every step: set it to 0, or kept_renderings to null"
+        )
+    reader = data.reader("train")
+    what = [plain(cfg.model.render), reader.identity, reader.fingerprint()]
     return str(Path(cfg.kept_renderings) / sha256_values(what)[:12])
 
 
@@ -112,7 +164,11 @@ def build_trainer(cfg: DictConfig) -> Trainer:
         return instantiate(
             cfg.trainer,
             logger=instantiate(logger) if logger else False,
-            callbacks=[instantiate(callback) for callback in wanted.values() if callback is not None],
+            callbacks=[
+                Record(cfg, Path(cfg.paths.output_dir) / "config.yaml"),  # first: others read it
+                *(instantiate(callback) for callback in wanted.values() if callback is not None),
+            ],
+            enable_progress_bar=cfg.callbacks.get("progress") is not None,
             plugins=[ClearCheckpointIO()],
             # Lightning counts batches where we count optimizer steps.
             val_check_interval=cfg.validation_every * cfg.trainer.accumulate_grad_batches,
@@ -134,7 +190,7 @@ def plain(node: Any) -> Any:
     return OmegaConf.to_container(node, resolve=True)
 
 
-def _checkpoint_to_resume(output_dir: Path, cfg: DictConfig, model_config: dict) -> Path | None:
+def _checkpoint_to_resume(output_dir: Path, cfg: DictConfig, model_config: dict, data: SceneDataModule) -> Path | None:
     last = last_checkpoint(output_dir)
     if not last.is_file():
         return None
@@ -144,10 +200,36 @@ def _checkpoint_to_resume(output_dir: Path, cfg: DictConfig, model_config: dict)
             "delete that folder"
         )
     check_resumable(last, model_config, cfg.trainer.accumulate_grad_batches)
+    try:
+        check_same_data(last, data.state_dict())
+    except CheckpointError as error:
+        if not cfg.other_data:
+            raise
+        log.warning("%s", error)
+    begun_from = read_checkpoint(last).get("begun_from")
+    if cfg.init is not None and begun_from is not None:
+        init = find_weights(cfg.init, cfg.paths.assets_dir)
+        if sha256_file(init) != begun_from:
+            raise CheckpointError(
+                f"the run of {last} began with other weights than init={cfg.init} has now ({init}): choose another "
+                "run_name to start afresh with these, or leave init out to go on"
+            )
     return last
 
 
-def _announce(module: NerfDiffModule, last: Path | None) -> None:
+def _sound(output_dir: Path) -> str:
+    """What is left of a run that diverged."""
+    last = last_checkpoint(output_dir)
+    if not last.is_file():
+        return "No checkpoint is from before that: start afresh"
+    try:
+        check_finite(last)
+    except CheckpointError as error:
+        return f"{error}: start afresh"
+    return f"{describe(last)} Its weights are finite: the same command goes on from there"
+
+
+def _announce(module: NerfDiffModule, last: Path | None, device: torch.device) -> None:
     counts = module.model.parameter_count()
     state = WEIGHTS_ADAM_EMA * counts["total"] / 2**30
     log.info(
@@ -157,4 +239,4 @@ def _announce(module: NerfDiffModule, last: Path | None) -> None:
         *(counts[part] / 1e6 for part in ("total", "encoder", "denoiser")),
         state,
     )
-    log.info("resuming from %s", last) if last else log.info("starting afresh")
+    log.info("%s on %s", f"resuming from {last}" if last else "starting afresh", device)

@@ -1,3 +1,6 @@
+import os
+import signal
+
 import pytest
 import torch
 from lightning import Callback, LightningModule, Trainer
@@ -5,6 +8,7 @@ from torch.utils.data import DataLoader
 
 from nerfdiff.callbacks.checkpoint import LastCheckpoint
 from nerfdiff.callbacks.ema import EMA
+from nerfdiff.stopping import Stopped
 
 
 class Line(LightningModule):
@@ -81,15 +85,15 @@ def test_every_use_after_training_sees_the_average(tmp_path):
         torch.testing.assert_close(fresh.validated[-1], average)
 
 
-class Fail(Callback):
+class Stop(Callback):
     def on_validation_batch_start(self, *args):
-        raise KeyboardInterrupt
+        os.kill(os.getpid(), signal.SIGINT)
 
 
 def test_an_interrupted_validation_leaves_sound_weights(tmp_path):
     module = Line()
-    run = trainer(tmp_path, EMA(0.9, 1), Fail(), LastCheckpoint(str(tmp_path), every_n_steps=100))
-    with pytest.raises(SystemExit):
+    run = trainer(tmp_path, EMA(0.9, 1), Stop(), LastCheckpoint(str(tmp_path), every_n_steps=100))
+    with pytest.raises(Stopped):
         run.fit(module, loader(), loader())
     saved = torch.load(tmp_path / "last.ckpt", weights_only=True)
     torch.testing.assert_close(saved["current_model_state"]["layer.weight"], module.history[-1])

@@ -1,6 +1,9 @@
 import csv
 import json
+import os
 import re
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -260,3 +263,148 @@ def test_a_file_that_is_named_twice_is_read_once(tmp_path, monkeypatch):
     known = content(chart([tmp_path, ".", tmp_path / "results.jsonl", tmp_path / "link"]))
     assert known["counts"].startswith("2 runs, 1 configurations, 1 failed runs")
     assert len(known["configurations"][0]["runs"]) == 1
+
+
+def test_lines_that_are_no_rows_are_told_and_cost_no_other(tmp_path):
+    path = write_results(tmp_path / "a", result(), failed("slow")) / "results.jsonl"
+    path.write_text('{"torn\n' + path.read_text() + "[[[\n")
+    write_results(tmp_path / "b", result("best"))
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / "results.jsonl").write_text("torn")
+    known = content(chart(tmp_path))
+    assert len(known["configurations"]) == 2 and len(known["failures"]) == 1
+    skipped, left_out = known["unread"]
+    assert f"{path}: 2 lines are no rows and were skipped: line 1: not JSON" in skipped
+    assert left_out.startswith("left out:") and "c/results.jsonl: 1 line is no row" in left_out
+    with pytest.raises(DataError, match="1 line is no row"):
+        chart(tmp_path / "c")
+
+
+def test_nothing_is_shown_from_outside_of_the_results(tmp_path):
+    write_sheet(tmp_path / "private" / "predictions")
+    write_sheet(tmp_path / "private")
+    results = tmp_path / "results"
+    (results / "run").mkdir(parents=True)
+    (results / "run" / "sheet.png").symlink_to(tmp_path / "private" / "sheet.png")
+    (results / "link").symlink_to(tmp_path / "private")
+    folders = ("../private", str(tmp_path / "private"), "link", "run", "run/../../private")
+    rows = [
+        result(folder=folder, strategy="../..", overrides=[f"x={n}"], run_id=folder) for n, folder in enumerate(folders)
+    ]
+    known = content(chart(write_results(results, *rows)))
+    runs = [entry["runs"][0] for entry in known["configurations"]]
+    assert [entry["small"] for entry in known["configurations"]] == [None] * 5
+    assert [run.get("folder") for run in runs] == [None, None, None, "../run", None]
+    assert not any("sheet" in run or "orbit" in run for run in runs)
+    assert [line for line in known["unread"] if line.startswith("4 of 5 runs say that their folders lie outside")]
+    # both are results
+    known = content(chart([results, tmp_path / "private"]))
+    assert known["configurations"][0]["small"] and not known["unread"]
+
+
+def png_header(width: int, height: int) -> bytes:
+    """The beginning of a picture that claims to be so large."""
+    size = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunk = struct.pack(">I", 13) + size + struct.pack(">I", zlib.crc32(size))
+    return b"\x89PNG\r\n\x1a\n" + chunk + struct.pack(">I", 999) + b"IDAT" + b"\0" * 20
+
+
+@pytest.mark.parametrize(
+    ("sheet", "words"),
+    [
+        (png_header(50_000, 50_000), "exceeds limit"),
+        (png_header(13_000, 13_000), "13000×13000 pixels are more than pictures.megapixels=64"),
+        (png_header(100, 100), "not shown"),
+        (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n", "cannot identify image file"),
+        (b"", "cannot identify image file"),
+        (None, "it is no file"),
+    ],
+    ids=["2.5 gigapixels", "169 megapixels", "torn", "PostScript", "empty", "pipe"],
+)
+def test_a_picture_that_cannot_be_shown_is_told_and_costs_nothing(tmp_path, sheet, words):
+    (tmp_path / "run").mkdir()
+    if sheet is None:
+        os.mkfifo(tmp_path / "run" / "sheet.png")
+    else:
+        (tmp_path / "run" / "sheet.png").write_bytes(sheet)
+    known = content(chart(write_results(tmp_path, result(folder="run"))))
+    assert known["configurations"][0]["small"] is None
+    (line,) = known["unread"]
+    assert "run/sheet.png: not shown" in line and words in line
+
+
+WORDS = (
+    "=1+1",
+    "+1",
+    "-1",
+    "@x",
+    "\tx",
+    "${oc.env:HOME}",
+    "$`x$",
+    "$x^{$",
+    "`ls`",
+    "[/bold]",
+    "_x",
+    "\\$",
+    "a\x1b[2Jb\nc",
+)
+
+
+def test_no_text_of_a_row_is_more_than_text(tmp_path):
+    same = {"dataset": "$x^{$", "device": "=$\\`$", "st_lpips_vgg": None}
+    rows = [
+        result(strategy=word, overrides=[word, f"x={word}"], run_id=word, error=word, model=word, **same)
+        for word in WORDS
+    ]
+    page = chart(write_results(tmp_path, *rows), png__costs=["scene_s"])
+    known = content(page)
+    assert {entry["strategy"] for entry in known["configurations"]} == set(WORDS)
+    for name in ("runs.csv", "configurations.csv"):
+        for line in read_csv(page.parent / name):
+            assert not any(cell.startswith(("=", "+", "-", "@", "\t")) for cell in line.values() if cell)
+            assert line["strategy"].removeprefix("'") in WORDS
+    assert [path.name for path in page.parent.glob("*.png")] == ["psnr-scene_s.png"]
+
+
+def test_pictures_of_very_much_or_very_long_text_are_of_bounded_size(tmp_path):
+    rows = [
+        result(
+            strategy=f"s{n}" + "x" * 5000, scene_s=timing(1.0 + n), psnr=20.0 + n, dataset="d" * 9999, st_lpips_vgg=None
+        )
+        for n in range(30)
+    ]
+    page = chart(write_results(tmp_path, *rows), png__costs=["scene_s"], png__lines=5)
+    with Image.open(page.parent / "psnr-scene_s.png") as image:
+        assert image.size[0] == 1080 and image.size[1] < 2000
+
+
+@pytest.mark.parametrize("values", [(0.0, -1.0), (1e-99, 9e99), (float("nan"), float("inf"), float("-inf"))])
+def test_impossible_numbers_make_a_page(tmp_path, values):
+    rows = [
+        result(name, overrides=[f"{field}={value}"], st_lpips_vgg=None, **{field: number})
+        for value in values
+        for name, field, number in (("good", "psnr", value), ("slow", "scene_s", timing(value, value)))
+    ]
+    rows += [result("cheap", st_lpips_vgg=None), result(seed=1, st_lpips_vgg=None)]
+    page = chart(write_results(tmp_path, *rows), png__costs=["scene_s"])
+    known = content(page)
+    assert len(known["configurations"]) == 2 * len(values) + 2
+    assert len(known["panels"][0]["frontiers"]["psnr"]["scene_s"]) and (page.parent / "psnr-scene_s.png").is_file()
+
+
+def test_runs_that_say_that_they_had_no_scenes_make_a_page(tmp_path):
+    assert len(content(chart(write_results(tmp_path, result(n_scenes=0, n_views=0))))["configurations"]) == 1
+
+
+def test_a_folder_that_cannot_be_read_is_told(tmp_path, monkeypatch):
+    write_results(tmp_path, result())
+    locked = write_results(tmp_path / "locked", result("slow"))
+    scandir = os.scandir
+
+    def refuse(path):
+        if Path(path) == locked:
+            raise PermissionError(13, "Permission denied", str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    assert content(chart(tmp_path))["unread"] == [f"left out: {locked}: Permission denied"]

@@ -360,10 +360,13 @@ def test_a_phone_shows_it_all(phone):
 
 
 def test_words_of_overrides_are_text_and_no_elements(open_page, tmp_path):
-    names = ("<img src=x>", "<b>bold</b>")
+    names = ("<img src=x>", "<b>bold</b>", "<a href='https://x.org'>x</a>")
     rows = [result(overrides=["strategy=ngd", f"run_name={name}"], run_id=name) for name in names]
     page = open_page(chart(write_results(tmp_path, *rows, failed("slow", strategy=None))))
     assert {text for text in page.locator("#table tbody td").all_inner_texts() if "<" in text} == set(names)
+    page.select_option("#colour", "run_name")
+    page.wait_for_function("document.querySelectorAll('.legendtext').length > 3")
+    assert set(names) < set(page.locator(".legendtext").all_text_contents()) and page.locator("#plot a").count() == 0
     page.locator("#failed-strip button").click()
     assert page.inner_text("#details h2") == "oom"
     assert page.locator("#table img, #table b").count() == 0 and page.complaints == []

@@ -57,11 +57,67 @@ def test_bounds_enclose_the_ball_for_every_camera():
     assert (near, far) == pytest.approx((2 - radius, 5 + radius))
 
 
-def test_near_stays_before_a_camera_inside_the_ball():
-    near, far = Gaze.of(looking(np.concatenate([sphere(20, 4.0, np.zeros(3)), [[0, 0.1, 0]]]), np.zeros(3))).bounds(
-        math.radians(30), "scene"
-    )
+def test_near_stays_before_cameras_inside_the_ball():
+    """More than may be astray."""
+    centres = np.concatenate([sphere(8, 4.0, np.zeros(3)), sphere(3, 0.1, np.zeros(3), seed=1)])
+    near, far = Gaze.of(looking(centres, np.zeros(3))).bounds(math.radians(30), "scene")
     assert (near, far) == pytest.approx((MIN_NEAR * 0.1, 6.0))
+
+
+STRAYS = {
+    "20 times as far": lambda poses: scaled(poses, [7], 20),
+    "5 times as far": lambda poses: scaled(poses, [0], 5),
+    "a twentieth as far": lambda poses: scaled(poses, [7], 1 / 20),
+    "two of them": lambda poses: scaled(scaled(poses, [3], 20), [9], 30),
+    "far and turned away": lambda poses: moved(poses, 5, [40.0, -30, 20]),
+}
+
+
+def scaled(poses: np.ndarray, views: list[int], times: float) -> np.ndarray:
+    poses = poses.copy()
+    poses[views, :3, 3] = AT + times * (poses[views, :3, 3] - AT)
+    return poses
+
+
+def moved(poses: np.ndarray, view: int, centre: list[float]) -> np.ndarray:
+    """Far off, and with an axis that misses by as much."""
+    poses = poses.copy()
+    poses[view, :3] = np.column_stack([np.eye(3), centre])
+    return poses
+
+
+AT = np.array([2.0, -1, 0.5])
+
+
+@pytest.mark.parametrize("name", STRAYS)
+def test_strays_do_not_set_the_bounds_of_all(name):
+    """Case 05: one camera that was registered 20 times as far took far from 1.87 to 26.6."""
+    right = looking(sphere(24, 1.3, AT), AT)
+    poses = STRAYS[name](right)
+    gaze, astray = Gaze.of(poses), np.flatnonzero((poses != right).any((1, 2)))
+    assert np.flatnonzero(gaze.stray).tolist() == astray.tolist()
+    np.testing.assert_allclose(gaze.point, AT, atol=1e-6)
+    assert gaze.bounds(0.45, "scene") == pytest.approx(Gaze.of(right).bounds(0.45, "scene"), rel=1e-6)
+    said = gaze.describe_strays([f"v{k}" for k in range(24)])
+    assert all(f"view v{k} is" in said for k in astray) and said.count("view v") == len(astray)
+    assert Gaze.of(right).describe_strays([f"v{k}" for k in range(24)]) is None
+
+
+@pytest.mark.parametrize("views", [6, 24])
+def test_a_stray_among_unsteady_hands_is_found(views):
+    rng = np.random.default_rng(2)
+    poses = np.concatenate([looking(c[None], rng.normal(0, 0.1, 3)) for c in sphere(views, 3.0, np.zeros(3))])
+    poses = moved(poses, 2, [50.0, 10, -60])
+    gaze = Gaze.of(poses)
+    assert np.flatnonzero(gaze.stray).tolist() == [2] and np.linalg.norm(gaze.point) < 0.2
+
+
+def test_a_second_ring_of_cameras_is_not_astray():
+    """Close-ups and views of the whole; nor is one of four cameras, too few to say which is wrong."""
+    centres = np.concatenate([sphere(12, 1.0, np.zeros(3)), sphere(8, 8.0, np.zeros(3), seed=1)])
+    found = Gaze.of(looking(centres, np.zeros(3)))
+    assert not found.stray.any() and found.bounds(0.3, "scene")[1] == pytest.approx(8 + math.sin(0.3))
+    assert not Gaze.of(scaled(looking(sphere(4, 1.0, AT), AT), [1], 20)).stray.any()
 
 
 def test_unsteady_hands_do_not_matter_much():

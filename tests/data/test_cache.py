@@ -50,6 +50,7 @@ def test_equals_the_reader(root):
     for index in range(4):
         assert copy.scene_id(index) == reader.scene_id(index)
         assert copy.view_names(index) == reader.view_names(index)
+        assert copy.listing(index).files == reader.listing(index).files
         for views in (None, [2, 0, 2], [-1]):
             here, there = copy.load(index, views), reader.load(index, views)
             assert (here.id, here.views, here.near, here.far) == (there.id, there.views, there.near, there.far)
@@ -108,7 +109,7 @@ def test_images_of_several_sizes_are_an_error(root):
 def test_no_room_is_told_before_decoding(root, monkeypatch):
     usage = namedtuple("usage", "total used free")(10, 10, 1000)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-    with pytest.raises(DataError, match=r"toy_train-.*GB are free.*data\.cache_dir.*data\.cache=false"):
+    with pytest.raises(DataError, match=r"takes 148 kB, and 1 kB are free.*data\.cache_dir.*data\.cache=false"):
         cached(root)
     assert caches(root) == set()
 

@@ -41,6 +41,8 @@ def datamodule(root, **changes) -> SceneDataModule:
         "cache": True,
         "cache_dir": root / "cache",
         "seed": 3,
+        "train_source_views": None,
+        "about": "made by a test",
     }
     return SceneDataModule(**settings | changes)
 
@@ -241,6 +243,7 @@ def test_test_scenes_are_shared_out_among_ranks(root, monkeypatch):
         ({"batch_size": 0}, r"data\.batch_size=0"),
         ({"target_views": 0}, r"data\.target_views=0"),
         ({"eval_stride": 0}, r"data\.eval_stride=0"),
+        ({"train_source_views": 0}, r"data\.train_source_views=0"),
         ({"eval_scenes": 0}, r"data\.eval_scenes=0"),
         ({"source_as_target": 1.5}, r"data\.source_as_target=1\.5"),
         ({"seed": -1}, r"data\.seed=-1"),

@@ -22,6 +22,7 @@ from nerfdiff.data.posed_images import PosedImagesReader
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.data.srn import SRNReader
 from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.inspection.all_views import refuse_missing_files
 
 MUTATIONS_PER_READER = 80
 
@@ -220,8 +221,10 @@ def read_all(reader: SceneReader) -> None:
     """Read everything, and check what no dataset may have, whatever lay on disk."""
     reader.fingerprint()
     for index in range(len(reader)):
-        names = reader.view_names(index)
+        names, listing = reader.view_names(index), reader.listing(index)
         scene = reader.load(index, truth=True)
+        assert tuple(listing.files) == names and all(file.is_file() for f in listing.files.values() for file in f)
+        np.testing.assert_allclose(scene.cameras.c2w, listing.c2w, rtol=1e-5, atol=1e-5)
         assert scene.views == names and len(set(names)) == len(names) > 0
         height, width = scene.pixels.shape[-2:]
         assert scene.pixels.shape == (len(names), 3, height, width)
@@ -233,6 +236,21 @@ def read_all(reader: SceneReader) -> None:
         for truth in (scene.mask, scene.depth):
             assert truth is None or truth.shape == (len(names), height, width)
         assert scene.depth is None or (scene.depth.isfinite().all() and scene.depth.min() >= 0)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_file_that_a_view_lacks_is_noticed_without_reading_it(tmp_path, name):
+    case, root = CASES[name], tmp_path / "data"
+    case.write(root)
+    files = list(case.read(root, tmp_path / "index").listing(0).files.values())[1]
+    assert len(files) > (name in ("srn", "srn_per_view", "abo_materials", "clevr3d", "nerfstudio"))
+    for k, file in enumerate(files):
+        content = file.read_bytes()
+        file.unlink()
+        with pytest.raises(DataError) as error:
+            refuse_missing_files(case.read(root, tmp_path / f"index{k}").listing(0))
+        assert file.stem in str(error.value) or re.search(r"a file: 1\b", str(error.value))
+        file.write_bytes(content)
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerfdiff.data.images import decode, decode_mask, decode_with_alpha, resize, resize_nearest, stored_size
+from nerfdiff.data.images import decode, decode_with_alpha, resize, resize_nearest, stored_size
+from nerfdiff.data.masks import read_mask
 from nerfdiff.errors import DataError
 
 
@@ -62,20 +63,6 @@ def test_sixteen_bits(tmp_path, rgb, channels):
     assert np.array_equal(decode(tmp_path / "a.png"), rgb if channels > 1 else np.repeat(rgb[..., :1], 3, -1))
 
 
-def test_mask(tmp_path):
-    Image.fromarray(np.array([[0, 255, 127, 128]], np.uint8)).save(tmp_path / "m.png")
-    assert decode_mask(tmp_path / "m.png").tolist() == [[False, True, False, True]]
-
-
-@pytest.mark.parametrize("levels", [[0, 1], [0, 255]])
-def test_masks_of_zero_and_one_are_those_of_black_and_white(tmp_path, levels):
-    where = np.array([[True, False, False], [True, True, False]])
-    Image.fromarray(np.array(levels, np.uint8)[where.astype(int)]).save(tmp_path / "m.png")
-    assert np.array_equal(decode_mask(tmp_path / "m.png"), where)
-    Image.fromarray(np.zeros((2, 3), np.uint8)).save(tmp_path / "m.png")
-    assert not decode_mask(tmp_path / "m.png").any()
-
-
 @pytest.mark.parametrize("damage", [lambda b: b[: len(b) // 2], lambda b: b"", lambda b: b"no image at all" * 9])
 def test_damaged_files_are_named(tmp_path, rgb, damage):
     path = tmp_path / "000007.png"
@@ -99,7 +86,7 @@ def test_damaged_files_are_named(tmp_path, rgb, damage):
 )
 def test_other_formats_are_not_called_damaged(tmp_path, content, message):
     (tmp_path / "a.png").write_bytes(content)
-    for read in (decode, decode_mask, stored_size):
+    for read in (decode, read_mask, stored_size):
         with pytest.raises(DataError, match=rf"a\.png: .*{message}") as error:
             read(tmp_path / "a.png")
         assert "\n" not in str(error.value)

@@ -11,6 +11,9 @@ from nerfdiff.errors import ConfigError, DataError
 
 SETTINGS = {
     "mask": None,
+    "open_border": 0.5,
+    "speck": 0.02,
+    "smallest": 8,
     "fov": 52.0,
     "near": 0.8,
     "far": 1.8,
@@ -96,17 +99,19 @@ def test_growing_interpolates_linearly():
 
 def test_other_shapes_are_padded_with_white(tmp_path):
     rgba(40, 80, (0, 0, 40, 80)).save(tmp_path / "wide.png")
-    rgba(60, 30, (0, 0, 59, 30)).save(tmp_path / "tall.png")
-    assert bounds(load(tmp_path / "tall.png", (32, 32))) == (0, 8, 32, 24)
-    assert bounds(load(tmp_path / "tall.png", (20, 40))) == (0, 15, 20, 25)
+    rgba(66, 36, (3, 3, 63, 33)).save(tmp_path / "tall.png")
+    assert bounds(load(tmp_path / "tall.png", (33, 33))) == (1, 9, 32, 24)
+    assert bounds(load(tmp_path / "tall.png", (22, 44))) == (1, 17, 21, 27)
     Image.open(tmp_path / "wide.png").save(tmp_path / "wide.webp", lossless=True)
     with pytest.raises(DataError, match="border is not white"):  # opaque all over, alpha or not
         load(tmp_path / "wide.png")
-    Image.new("L", (80, 40), 255).save(tmp_path / "all.png")
-    wide = load(tmp_path / "wide.webp", mask=str(tmp_path / "all.png"))
-    assert bounds(wide) == (8, 0, 24, 32)
-    assert (wide[8:24] == COLOUR).all() and (wide[:8] == 255).all()
-    assert bounds(load(tmp_path / "wide.webp", (20, 40), mask=str(tmp_path / "all.png"))) == (0, 0, 20, 40)
+    mask = np.zeros((40, 80), np.uint8)
+    mask[:, 20:60] = 255
+    Image.fromarray(mask).save(tmp_path / "most.png")
+    wide = load(tmp_path / "wide.webp", mask=str(tmp_path / "most.png"))
+    assert bounds(wide) == (8, 8, 24, 24)
+    assert (wide[8:24, 8:24] == COLOUR).all() and (wide[:8] == 255).all()
+    assert bounds(load(tmp_path / "wide.webp", (20, 40), mask=str(tmp_path / "most.png"))) == (0, 10, 20, 30)
 
 
 @pytest.mark.parametrize(("share", "centre"), [(0.5, (0.5, 0.5)), (0.75, (0.5, 0.5)), (0.5, (0.375, 0.625))])
@@ -161,6 +166,112 @@ def test_on_white_the_object_is_what_is_not(tmp_path, mode):
     image.save(tmp_path / "a.tiff")
     framed = load(tmp_path / "a.tiff", (40, 40), object_share=0.5)
     assert (framed[10:30, 10:30] == 30).all() and (framed[:10] > 245).all() and (framed[:, 30:] > 245).all()
+
+
+def clean(side: int = 64) -> np.ndarray:
+    """A dark disc with a white hole on white, off the middle."""
+    y, x = np.mgrid[:side, :side] + 0.5
+    distance = np.hypot(y - 0.45 * side, x - 0.4 * side)
+    return np.where(((distance < 0.3 * side) & (distance > 0.1 * side))[..., None], COLOUR, 255).astype(np.uint8)
+
+
+def cut_out(colours: np.ndarray) -> np.ndarray:
+    """The same with transparency for white."""
+    return np.dstack([colours, np.where((colours == 255).all(-1), 0, 255).astype(np.uint8)])
+
+
+def dust(image: np.ndarray, ink: tuple[int, ...]) -> np.ndarray:
+    image = image.copy()
+    image[-3:-1, -3:-1] = image[1:3, 1:3] = ink
+    return image
+
+
+def text(image: np.ndarray) -> np.ndarray:
+    """Strokes of a watermark."""
+    image = image.copy()
+    image[-6:-3, 30:60:4] = 90
+    return image
+
+
+def haze(image: np.ndarray) -> np.ndarray:
+    """What programs that cut out leave: a little alpha everywhere, and soft blots."""
+    image = image.copy()
+    image[image[..., 3] == 0] = (0, 0, 0, 4)
+    image[55:60, 55:60] = (0, 0, 0, 90)
+    return image
+
+
+def round_corners(image: np.ndarray) -> np.ndarray:
+    y, x = np.mgrid[: len(image), : len(image)]
+    far = np.minimum(y, y[::-1]) + np.minimum(x, x[:, ::-1]) < 6
+    return np.dstack([image, np.where(far, 0, 255).astype(np.uint8)])
+
+
+UNTIDY = {
+    "dust": dust(clean(), (120, 120, 120)),
+    "watermark": text(clean()),
+    "near-white background": np.where(clean() == 255, 253, clean()).astype(np.uint8),
+    "rounded corners": round_corners(clean()),
+    "dust of a cut-out": dust(cut_out(clean()), (30, 30, 30, 255)),
+    "haze of a cut-out": haze(cut_out(clean())),
+    "alpha that says nothing": np.dstack([clean(), np.full((64, 64), 255, np.uint8)]),
+}
+
+
+@pytest.mark.parametrize("share", [None, 0.65])
+@pytest.mark.parametrize("name", UNTIDY)
+def test_specks_and_shades_of_white_change_nothing(tmp_path, name, share):
+    for file, array in (("clean", clean()), ("untidy", UNTIDY[name])):
+        Image.fromarray(array).save(tmp_path / f"{file}.png")
+    expected, found = (load(tmp_path / f"{file}.png", object_share=share) for file in ("clean", "untidy"))
+    hole = {"near-white background": 2}.get(name, 0)  # what is enclosed may be the object's and stays as it is
+    assert np.abs(found.astype(int) - expected).max() <= hole
+    assert (found[0] == 255).all() and (found[:, -1] == 255).all()
+
+
+def test_specks_of_a_mask_are_left_out_and_the_box_is_told(tmp_path, caplog):
+    Image.fromarray(np.random.default_rng(0).integers(0, 200, (64, 64, 3), dtype=np.uint8)).save(tmp_path / "photo.png")
+    mask = np.zeros((64, 64), np.uint8)
+    mask[20:40, 10:30] = mask[44:50, 10:20] = 255  # a second part of 15 % is the object's
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    mask[60:62, 60:62] = mask[3, 3] = 255
+    Image.fromarray(mask).save(tmp_path / "specks.png")
+    with caplog.at_level("INFO"):
+        pair = [load(tmp_path / "photo.png", mask=tmp_path / f"{n}.png", object_share=0.5) for n in ("mask", "specks")]
+    assert np.array_equal(*pair)
+    assert "photo.png: the object fills rows 20 to 50, columns 10 to 30 of 64x64" in caplog.messages[0]
+    assert caplog.messages[0].endswith("64x64") and "left out 2 specks of 5 pixels" in caplog.messages[1]
+
+
+@pytest.mark.parametrize("cut_by_frame", [False, True])
+def test_an_inverted_mask_is_refused(tmp_path, cut_by_frame):
+    mask = np.zeros((64, 64), np.uint8)
+    mask[20 : 64 if cut_by_frame else 50, 10:50] = 255
+    Image.fromarray(np.where(mask[..., None] > 0, COLOUR, 255).astype(np.uint8)).save(tmp_path / "car.png")
+    for name, array in (("right", mask), ("inverted", 255 - mask)):
+        Image.fromarray(array).save(tmp_path / f"{name}.png")
+    assert (load(tmp_path / "car.png", mask=tmp_path / "right.png") < 250).any()
+    with pytest.raises(DataError, match=r"inverted\.png: .*car\.png.* found a mask that is white on .* inverted"):
+        load(tmp_path / "car.png", mask=tmp_path / "inverted.png")
+
+
+def test_frames_without_an_object_are_refused(tmp_path):
+    blank = np.full((64, 64, 3), 255, np.uint8)
+    blank[30:32, 30:33] = 40  # a single speck is no object
+    Image.fromarray(blank).save(tmp_path / "speck.png")
+    with pytest.raises(DataError, match=r"speck\.png: no object in it; .* is 2x3 pixels \(rows 30 to 32, columns 30"):
+        load(tmp_path / "speck.png")
+    Image.fromarray(np.where(clean() == 255, 255, 250).astype(np.uint8)).save(tmp_path / "pale.png")
+    mask = np.zeros((64, 64), np.uint8)
+    mask[20:40, 10:30] = 255  # beside what is to be seen
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    for file, chosen in (("pale", None), ("pale", tmp_path / "mask.png")):
+        with pytest.raises(DataError, match=rf"{file}\.png: no object in it"):
+            load(tmp_path / f"{file}.png", mask=chosen)
+    photo = np.random.default_rng(0).integers(0, 200, (64, 64, 3), dtype=np.uint8)
+    Image.fromarray(round_corners(photo)).save(tmp_path / "rounded.png")
+    with pytest.raises(DataError, match=r"rounded\.png: \d+% of its border is not white, and only \d+% is transparent"):
+        load(tmp_path / "rounded.png")
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -235,9 +346,10 @@ def test_errors_name_the_file_and_what_to_do(tmp_path):
         image.save(tmp_path / f"{name}.png")
         with pytest.raises(DataError, match=rf"{name}\.png: no object in it"):
             load(tmp_path / f"{name}.png")
-    Image.new("L", (20, 10)).save(tmp_path / "mask.png")
-    with pytest.raises(DataError, match=r"street\.jpg: no object in it"):
-        load(tmp_path / "street.jpg", mask=str(tmp_path / "mask.png"))
+    for level, found in ((0, "all black"), (255, "all white")):
+        Image.new("L", (20, 10), level).save(tmp_path / "mask.png")
+        with pytest.raises(DataError, match=rf"mask\.png: .*street\.jpg .*found a mask that is {found}"):
+            load(tmp_path / "street.jpg", mask=str(tmp_path / "mask.png"))
 
 
 @pytest.mark.parametrize(
@@ -250,6 +362,9 @@ def test_errors_name_the_file_and_what_to_do(tmp_path):
         ("object_centre", [0.5, 1.5]),
         ("white", 0.0),
         ("white_border", 1.1),
+        ("open_border", 0.0),
+        ("speck", -0.1),
+        ("smallest", 0),
     ],
 )
 def test_impossible_settings(key, value):

@@ -138,6 +138,44 @@ def test_masks_put_the_rest_on_white(tmp_path):
     assert torch.equal(scene.pixels[~outside], plain.pixels[~outside])
 
 
+def repaint_masks(folder, change) -> None:
+    for file in (folder / "masks").iterdir():
+        Image.fromarray(change(np.asarray(Image.open(file)))).save(file)
+
+
+def test_masks_of_the_other_polarity_are_refused_or_read_as_such(tmp_path):
+    """Case 02: white where the background is, as instant-ngp marks what to leave out."""
+    write_nerfstudio(tmp_path)
+    right = read(tmp_path).load(0, truth=True)
+    repaint_masks(tmp_path, lambda mask: 255 - mask)
+    with pytest.raises(DataError, match=r"border in 6 of 6 views; they look inverted.*inverted_masks=true") as error:
+        read(tmp_path).load(0)
+    assert str(tmp_path) in str(error.value) and "\n" not in str(error.value)
+    mended = read(tmp_path, inverted_masks=True)
+    assert torch.equal(mended.load(0, truth=True).mask, right.mask)
+    assert torch.equal(mended.load(0).pixels, right.pixels)
+    assert mended.identity != read(tmp_path).identity  # a cache of the one is not taken for the other's
+    assert (read(tmp_path, max_mask_border=None).load(0).pixels != right.pixels).any()
+    assert (read(tmp_path, white_background=False).load(0).pixels == 90).any()
+    assert read(tmp_path).load(0, [0]).pixels.shape[0] == 1  # single views tell nothing
+
+
+@pytest.mark.parametrize(("level", "words"), [(0, "empty in every view"), (255, "cover all of every view")])
+def test_masks_of_nothing_and_of_everything_are_refused(tmp_path, level, words):
+    write_nerfstudio(tmp_path)
+    repaint_masks(tmp_path, lambda mask: np.full_like(mask, level))
+    with pytest.raises(DataError, match=words):
+        read(tmp_path).load(0)
+
+
+def test_an_alpha_of_which_nothing_is_transparent_is_no_mask(tmp_path):
+    write_blender(tmp_path)
+    assert read(tmp_path).load(0, truth=True).mask is not None
+    for file in tmp_path.glob("*/*.png"):
+        Image.open(file).convert("RGB").convert("RGBA").save(file)
+    assert read(tmp_path).load(0, truth=True).mask is None
+
+
 def test_without_masks_there_are_none(tmp_path):
     write_nerfstudio(tmp_path, masks=False)
     scene = read(tmp_path).load(0, truth=True)
@@ -342,6 +380,24 @@ def test_the_image_cache_keeps_each_scenes_bounds(tmp_path):
         assert torch.equal(here.pixels, there.pixels) and torch.equal(here.cameras.K, there.cameras.K)
         assert (here.near, here.far) == (there.near, there.far)
     assert reader.load(0).near != reader.load(1).near
+
+
+def test_a_stray_camera_is_named_and_does_not_set_the_bounds(tmp_path, caplog):
+    """Case 05: far went from 1.87 to 26.6 for all views."""
+    write_nerfstudio(tmp_path, views=12)
+    right = read(tmp_path).load(0)
+
+    def scatter(content):
+        for row in content["frames"][3]["transform_matrix"][:3]:
+            row[3] *= 20
+
+    assert "stray" not in caplog.text
+    edit(tmp_path / "transforms.json", scatter)
+    found = read(tmp_path).load(0)
+    assert (found.near, found.far) == pytest.approx((right.near, right.far), rel=0.05)
+    assert "stray cameras: view frame_00004 is" in caplog.text and "data.reader.near" in caplog.text
+    caplog.clear()
+    assert read(tmp_path, near=1.0, far=90.0).load(0).far == 90.0 and "stray" not in caplog.text
 
 
 def test_the_configuration_reads_a_scene(tmp_path):

@@ -64,7 +64,7 @@ def nerfstudio(root: Path, _: Path, **lens) -> PosedImagesReader:
     posed_fixtures.write_nerfstudio(root, views=4, **lens)
     repaint(root, "images/*.png", "RGB", (255, 255, 255))
     repaint(root, "masks/*.png", "L", 0)
-    return PosedImagesReader(root, "train", **posed_fixtures.SETTINGS)
+    return PosedImagesReader(root, "train", max_mask_border=None, **posed_fixtures.SETTINGS)
 
 
 def blender(root: Path, _: Path) -> PosedImagesReader:

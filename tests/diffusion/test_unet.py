@@ -226,7 +226,9 @@ def test_patches_move_the_work_to_smaller_images():
 
 
 def test_patches_are_whole_and_levels_count_from_the_input():
-    with pytest.raises(ConfigError, match=r"model\.unet\.patch=2: images of 15x20 pixels are not made of whole patches"):
+    with pytest.raises(
+        ConfigError, match=r"model\.unet\.patch=2: images of 15x20 pixels are not made of whole patches"
+    ):
         unet(patch=2, attention_downsampling=[4])(torch.randn(1, 3, 15, 20), torch.rand(1))
     with pytest.raises(ConfigError, match=r"model\.unet\.patch=0"):
         unet(patch=0)

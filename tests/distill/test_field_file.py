@@ -4,6 +4,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from fault_fixtures import flip
 from model_fixtures import input_cameras, look_at, model
 from nerfdiff.cameras import Cameras
 from nerfdiff.distill.field_file import FIELD, SavedField, load_field, save_field
@@ -48,4 +49,12 @@ def test_what_is_no_field_is_named(content, tmp_path):
     elif content == "other tensors":
         save_file({"weight": torch.zeros(2)}, path)
     with pytest.raises(DataError, match=r"field\.safetensors: not a field saved by this project"):
+        load_field(path)
+
+
+def test_bytes_that_changed_are_noticed(saved, tmp_path):
+    path = tmp_path / FIELD
+    save_field(path, saved)
+    flip(path, 1, seed=5, start=path.stat().st_size // 2)
+    with pytest.raises(DataError, match="its bytes changed since it was written"):
         load_field(path)

@@ -10,7 +10,7 @@ from nerfdiff.errors import ConfigError
 
 def images(seed: int):
     noise = torch.Generator().manual_seed(seed)
-    return [torch.randn(2, 3, 4, 5, generator=noise, dtype=torch.float64) for _ in range(4)]
+    return [0.1 * torch.randn(2, 3, 4, 5, generator=noise, dtype=torch.float64) for _ in range(4)]
 
 
 @pytest.mark.parametrize("compare", ["current", "last"])
@@ -43,6 +43,19 @@ def test_weights_stay_between_0_and_1_from_one_end_of_t_to_the_other(schedule):
         assert torch.isfinite(weights).all() and weights.min() >= 0 and weights.max() <= 1
         assert (weights.diff() >= 0).all(), "more noise, more guidance"
         assert (gamma > 0) == bool(weights.max() > 0)
+
+
+@pytest.mark.parametrize("compare", ["current", "last"])
+@pytest.mark.parametrize("gamma", [0.3, 1.0])
+def test_guided_images_stay_images(compare, gamma):
+    """Against a naive loop in float64; a rendering and a last image that differ much lead out of [-1, 1]."""
+    x0, rendered, last = (values.sign().float() * 0.9 for values in images(2)[:3])
+    guided = Guidance("constant", gamma, compare)(x0, rendered, last, torch.tensor(0.5))
+    triples = zip(*(values.flatten().tolist() for values in (x0, rendered, last)), strict=True)
+    free = [x - gamma * ((x if compare == "current" else before) - seen) for x, seen, before in triples]
+    assert (max(free) > 1) == (compare == "last")
+    expected = torch.tensor([max(-1.0, min(1.0, value)) for value in free]).reshape(guided.shape)
+    torch.testing.assert_close(guided, expected)
 
 
 def test_unknown_settings_are_refused_with_the_known_ones():

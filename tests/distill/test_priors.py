@@ -118,6 +118,27 @@ def test_own_views_are_the_inputs_and_the_others():
     assert torch.equal(OwnViews(2)(batch).c2w[0], all_cameras(batch).c2w[[0, 2]])
 
 
+def test_fewer_views_than_asked_for_are_said_once(caplog):
+    batch = scene([camera(c) for c in ((2, 0, 1), (0, 2, 1.2), (-2, 0.3, 0.8))])
+    for _ in range(2):
+        assert OwnViews(41)(batch).shape == OwnViews(3)(batch).shape == (1, 3)
+    assert len(caplog.messages) == 1
+    assert "3 virtual views instead of the 41 of budget.views" in caplog.messages[0]
+    assert "data.eval_stride" in caplog.messages[0]
+
+
+@pytest.mark.parametrize("budget", ["budget=paper", "budget=minutes", "budget.views=7"])
+@pytest.mark.parametrize("data", ["abo", "abo_materials", "srn_cars", "srn_chairs", "clevr3d", "posed_images"])
+def test_the_budget_s_views_are_those_of_every_dataset_s_prior(data, budget):
+    cfg = load_config("distill", ["ckpt=x", f"data={data}", budget])
+    assert cfg.prior.views == cfg.budget.views == {"paper": 50, "minutes": 25, "7": 7}[budget.split("=")[1]]
+
+
+def test_no_views_are_refused():
+    with pytest.raises(ConfigError, match=r"prior\.views=0 must be at least 1"):
+        Sphere(0, (0.0, 1.0), (0.0, 1.0), 0.0)
+
+
 @pytest.mark.parametrize("start", [0.0, 1.1, 4.0])
 def test_the_circle_goes_through_clevrs_cameras_around_what_they_look_at(start):
     """Equal heights and distances: the estimate is exact, and every true camera is on the circle."""

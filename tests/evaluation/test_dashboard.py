@@ -103,6 +103,15 @@ def test_curves_are_means_over_scenes_by_step_and_values_scene_by_scene(tmp_path
     assert "distill/weight" not in curves and "scenes/lpips" not in curves
 
 
+def test_a_lost_scene_leaves_the_others_their_curve(tmp_path):
+    lost = row(tmp_path)
+    trace = tmp_path / lost.folder / "predictions" / "ngd" / "a" / "trace.csv"
+    trace.write_text("step,t,weight,loss_first,loss_last,agreement\n0,0.5,,nan,nan,nan\n")
+    Dashboard((), LAYOUT).write(config(tmp_path), lost, None)
+    curves = scalars(read(tmp_path / "tensorboard" / "curves" / "job0" / "ngd-0123abcd"))
+    assert curves["distill/agreement"] == [30.0, 50.0]
+
+
 def test_a_failed_run_is_shown_as_one(tmp_path):
     early = ResultRow(run_id="x", status="oom", strategy="ngd", overrides=["seed=3"], error="no | room")
     Dashboard([], LAYOUT).write(config(tmp_path), early, None)

@@ -1,9 +1,19 @@
 import math
 
 import numpy as np
+import pytest
 import torch
 
-from nerfdiff.metrics.image import dequantise, gradient_energy, psnr, quantise, sharpness, ssim, ssim_gaussian
+from nerfdiff.metrics.image import (
+    dequantise,
+    gradient_energy,
+    psnr,
+    psnr_of_mse,
+    quantise,
+    sharpness,
+    ssim,
+    ssim_gaussian,
+)
 
 
 def picture_pair(n=2, size=16, seed=0):
@@ -39,8 +49,21 @@ def test_every_8_bit_level_survives_a_round_trip_in_any_precision():
 def test_psnr_of_a_constant_offset_is_the_closed_form():
     truth = torch.full((2, 3, 8, 8), 0.5)
     offsets = torch.tensor([0.1, 0.25])[:, None, None, None]
-    expected = [-10 * math.log10(d * d + 1e-6) for d in (0.1, 0.25)]
+    expected = [-20 * math.log10(d) for d in (0.1, 0.25)]
     torch.testing.assert_close(psnr(truth + offsets, truth), torch.tensor(expected).double(), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("dB", [10.0, 36.0, 45.0, 59.9, 61.0])
+def test_psnr_is_that_of_a_naive_loop_and_only_capped(dB):
+    noise = np.random.default_rng(0).standard_normal((3, 6, 5)) * 10 ** (-dB / 20)
+    predictions, truth = (torch.from_numpy(x)[None] for x in (0.5 + noise, np.full_like(noise, 0.5)))
+    total = 0.0
+    for predicted, true in zip(predictions.flatten().tolist(), truth.flatten().tolist(), strict=True):
+        total += (predicted - true) ** 2
+    expected = min(60.0, -10 * math.log10(total / noise.size))
+    assert psnr(predictions, truth).item() == pytest.approx(expected, abs=1e-9)
+    single = psnr_of_mse(torch.tensor(total / noise.size, dtype=torch.float32))  # as training and distillation log it
+    assert single.item() == pytest.approx(expected, abs=1e-4)
 
 
 def test_psnr_of_equal_images_is_60_dB():

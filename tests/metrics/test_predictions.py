@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -68,6 +70,32 @@ def test_a_scene_can_be_written_again(tmp_path):
     predictions.write("a", ("0", "1"), images(seed=1))
     predictions.write("a", ("0",), images(n=1, seed=2))
     assert read_prediction(tmp_path / "none", "a").views == ("0",)
+
+
+def test_a_scene_is_made_by_one_process(tmp_path):
+    """Another process holds the first of three scenes; the second is complete. Then it dies."""
+    predictions = writer(tmp_path, scenes=("a", "b", "c"))
+    predictions.write("b", ("0", "1"), images())
+    hold = "import fcntl, sys; f = open(sys.argv[1], 'a+b'); fcntl.lockf(f, fcntl.LOCK_EX, 1, 0); print(); input()"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    other = subprocess.Popen([sys.executable, "-c", hold, str(tmp_path / "none" / ".claims")], **pipes)
+    other.stdout.readline()
+    assert [predictions.claim(scene) for scene in "abc"] == [False, False, True]
+    predictions.release("c")
+    other.kill()
+    assert predictions.claim("a", wait=True)
+    other.communicate()
+
+
+def test_a_plan_that_a_power_cut_emptied_is_made_anew(tmp_path):
+    writer(tmp_path)
+    (tmp_path / "none" / "plan.json").write_text("")
+    predictions = writer(tmp_path)
+    assert read_plan(tmp_path / "none")["scenes"] == ["a", "b"]
+    predictions.write("a", ("0", "1"), images())
+    (tmp_path / "none" / "plan.json").write_text("")
+    with pytest.raises(DataError, match=r"plan\.json"):  # whose predictions these are, nobody knows
+        writer(tmp_path)
 
 
 def test_predictions_of_two_models_are_not_mixed(tmp_path):

@@ -68,7 +68,7 @@ def scorer(**changes):
 
 
 def decibels(offset):
-    return -10 * math.log10((offset / 255) ** 2 + 1e-6)
+    return -10 * math.log10(max((offset / 255) ** 2, 1e-6))
 
 
 def rows(path):

@@ -6,9 +6,11 @@ import sqlite3
 import pytest
 import torch
 import torch.nn.functional as F
+from safetensors.torch import save_file
 
 from model_fixtures import config
-from nerfdiff.checkpoint import load_model
+from nerfdiff.callbacks.snapshots import average_of
+from nerfdiff.checkpoint import export, load_model
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.errors import CheckpointError, ConfigError
 from nerfdiff.modules.kept_renderings import KeptRenderings
@@ -81,6 +83,22 @@ def test_without_the_way_through_the_rendering_the_field_has_no_gradient_of_the_
     assert not torch.allclose(through[name], alone[name])
 
 
+def test_a_share_of_rays_that_rounds_to_all_is_all(batch):
+    whole, rounded = (gradients(module({"lambda_dm": 0, "ray_share": share}), batch) for share in (1, 0.999))
+    assert whole.keys() == rounded.keys()
+
+
+def test_every_target_has_a_time_of_its_own(batch, monkeypatch):
+    seen = []
+    made = module({})
+    velocity = made.model.denoiser.velocity
+    monkeypatch.setattr(
+        made.model.denoiser, "velocity", lambda z, t, c: (seen.extend(t.tolist()), velocity(z, t, c))[1]
+    )
+    made.training_step(batch, 0)
+    assert len(set(seen)) == 4  # two draws of two targets
+
+
 def test_kept_renderings_are_what_would_be_rendered(batch, tmp_path):
     plain, keeping = module({"lambda_ic": 0}), module({"lambda_ic": 0}, kept_renderings=str(tmp_path))
     encoding = plain.model.encode(batch.source, batch.source_cameras, batch.near, batch.far)
@@ -90,7 +108,7 @@ def test_kept_renderings_are_what_would_be_rendered(batch, tmp_path):
     torch.testing.assert_close(first, rendered, atol=0.5 / 255 + 1e-5, rtol=0)
     assert torch.equal(first, second)
     with sqlite3.connect(keeping.kept.path) as file:
-        assert file.execute("SELECT count(*) FROM renderings").fetchone() == (4,)
+        assert file.execute("SELECT count(*) FROM checked").fetchone() == (4,)
 
 
 def test_kept_renderings_are_made_once(tmp_path):
@@ -124,8 +142,15 @@ def test_losses_that_cannot_be(losses, message):
 
 def test_two_phases_as_a_person_runs_them(data, tmp_path):
     field = tmp_path / "field"
-    run_training(data, field, *FIELD)
-    more = ["losses.lambda_ic=0", f"init={field}", f"kept_renderings={tmp_path / 'kept'}", "data.train_source_views=1", "optimizer.decay=none"]
+    run_training(data, field, *FIELD, "data.about=tests")
+    more = [
+        "losses.lambda_ic=0",
+        f"init={field}",
+        f"kept_renderings={tmp_path / 'kept'}",
+        "data.train_source_views=1",
+        "optimizer.decay=none",
+        "data.about=tests",
+    ]
     run_training(data, tmp_path / "cdm", *more)
     before, after = (load_model(run, "raw", "assets").model.state_dict() for run in (field, tmp_path / "cdm"))
     averaged = load_model(field, "ema", "assets").model.state_dict()
@@ -134,10 +159,20 @@ def test_two_phases_as_a_person_runs_them(data, tmp_path):
             assert not torch.equal(value, before[name])  # trained
         elif not name.startswith("denoiser"):
             assert torch.equal(value, averaged[name]), name  # the field as it was given
-    (kept,) = (tmp_path / "kept").glob("*/renderings.sqlite")
+    (kept,) = (tmp_path / "kept").glob("*/*/renderings.sqlite")
     with sqlite3.connect(kept) as file:
-        names = [name for (name,) in file.execute("SELECT name FROM renderings")]
+        names = [name for (name,) in file.execute("SELECT name FROM checked")]
     assert names and all(name.split("/")[1] == "000000" for name in names)  # one source view of each scene
+
+    # what it was trained on goes with it
+    phases = load_model(tmp_path / "cdm" / "model", "ema").trained_on
+    assert [(p["part"], p["images"], p["scenes"], p["about"]) for p in phases] == [
+        ("field", 24, 3, "tests"), ("CDM", 24, 3, "tests")
+    ]  # fmt: skip
+    assert (
+        "24 images for the field of 3 scenes of srn_cars (tests), then 24 images for the CDM"
+        in load_model(tmp_path / "cdm", "ema").describe()
+    )
 
     # stopped and resumed: the same bits, whatever is kept already
     half = tmp_path / "half"
@@ -152,5 +187,48 @@ def test_two_phases_as_a_person_runs_them(data, tmp_path):
 def test_kept_renderings_need_a_field_that_stays(data, tmp_path):
     with pytest.raises(ConfigError, match="init=<checkpoint>"):
         run_training(data, tmp_path / "a", "losses.lambda_ic=0", f"kept_renderings={tmp_path}")
+    moving = ["losses.lambda_ic=0", "init=demo", f"kept_renderings={tmp_path}", "data.source_target_noise=0.3"]
+    with pytest.raises(ConfigError, match=r"data\.source_target_noise=0\.3 moves"):
+        run_training(data, tmp_path / "b", *moving)
     with pytest.raises(ConfigError, match=r"losses\.lambda_ic=0"):
         module({}, kept_renderings=str(tmp_path))
+
+
+def test_a_model_to_begin_with_must_fit(data, tmp_path):
+    with pytest.raises(CheckpointError, match=r"init=demo does not fit this run's model \(.*field\.channels: \d+ → 4"):
+        run_training(data, tmp_path, "init=demo")
+
+
+def test_a_run_goes_on_with_what_it_began_with(data, tmp_path):
+    """Else its renderings would be of one field under the name of another."""
+    for name in ("a", "b"):
+        run_training(data, tmp_path / name, *FIELD, f"seed={'ab'.index(name)}", "trainer.max_steps=1")
+    words = ["losses.lambda_ic=0", f"kept_renderings={tmp_path / 'kept'}"]
+    with pytest.raises(ConfigError, match="set init=<checkpoint>"):
+        run_training(data, tmp_path / "cdm", *words)
+    run_training(data, tmp_path / "cdm", *words, f"init={tmp_path / 'a'}", "trainer.max_steps=1")
+    with pytest.raises(CheckpointError, match="began with other weights than init="):
+        run_training(data, tmp_path / "cdm", *words, f"init={tmp_path / 'b'}", "trainer.max_steps=2")
+    run_training(data, tmp_path / "cdm", *words, f"init={tmp_path / 'a'}", "trainer.max_steps=2")
+    run_training(data, tmp_path / "other", *words, f"init={tmp_path / 'b'}", "trainer.max_steps=1")
+    assert len(list((tmp_path / "kept").glob("*/*/renderings.sqlite"))) == 2  # one for each field
+
+
+def test_averages_are_of_the_model_they_are_exported_with(data, tmp_path):
+    settings = "{_target_: nerfdiff.callbacks.snapshots.Snapshots, folder: %s, every_n_steps: 1, lengths: [0.05, 0.1]}"
+    run = tmp_path / "run"
+    run_training(data, run, f"callbacks.snapshots={settings % (run / 'snapshots')}")
+    export(run, "ema", tmp_path / "out", "float32", None, average=0.1)
+    made, expected = load_model(tmp_path / "out", "ema"), average_of(run / "snapshots", 0.1)
+    assert made.trained_on[-1]["average"] == 0.1
+    assert all(torch.equal(value, expected[name]) for name, value in made.model.named_parameters())
+    save_file({"other": torch.zeros(1)}, run / "snapshots/step_0000006_0.1.safetensors", {"step": "6", "length": "0.1"})
+    with pytest.raises(CheckpointError, match="of another model"):
+        export(run, "ema", tmp_path / "out", "float32", None, average=0.1)
+    (run / "snapshots/step_0000001_0.1.safetensors").write_bytes(b"x" * 99)
+    with pytest.raises(CheckpointError, match="not a readable snapshot"):
+        export(run, "ema", tmp_path / "out", "float32", None, average=0.1)
+    settings = (tmp_path / "out/model.yaml").read_text()
+    (tmp_path / "out/model.yaml").write_text(settings.replace("images: 24", "images: many"))
+    with pytest.raises(CheckpointError, match="trained_on"):
+        load_model(tmp_path / "out", "ema")

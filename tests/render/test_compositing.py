@@ -1,5 +1,6 @@
 import math
 
+import pytest
 import torch
 
 from nerfdiff.render.compositing import compositing_weights
@@ -27,6 +28,16 @@ def test_many_nearly_transparent_samples_add_up_from_bf16_inputs():
     density = torch.full((1, 128), 0.0019, dtype=torch.bfloat16)
     opacity = compositing_weights(density, torch.ones(1, 128)).sum()
     assert abs(1 - float(opacity) - math.exp(-128 * float(density[0, 0]))) < 1e-5
+
+
+@pytest.mark.parametrize("dense", [40.0, 1e4, 1e7, 1e12, math.inf])
+def test_little_before_much_is_seen_for_what_it_is(dense):
+    """A sum of σδ less its last term would have swallowed the small ones: then weights add up to more than 1."""
+    optical = [1e-3, 0.02, 0.3, dense, 1e-3, 5.0, dense, 0.1]
+    weights = compositing_weights(torch.tensor([optical]), torch.ones(1, len(optical)))
+    expected = torch.tensor([naive_weights(optical, [1.0] * len(optical))], dtype=torch.float64)
+    torch.testing.assert_close(weights.double(), expected, atol=1e-7, rtol=1e-6)
+    assert float(weights.double().sum()) <= 1 + 1e-6
 
 
 def test_opaque_sample_hides_what_is_behind():

@@ -1,4 +1,6 @@
 import dataclasses
+import re
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -6,7 +8,15 @@ import pytest
 
 from chart_fixtures import SCENES, failed, result, timing, write_results, write_scores
 from nerfdiff.errors import DataError
-from nerfdiff.results.frame import configurations, configurations_frame, find_results, newest, read_runs, runs_frame
+from nerfdiff.results.frame import (
+    Run,
+    configurations,
+    configurations_frame,
+    find_results,
+    newest,
+    read_runs,
+    runs_frame,
+)
 from nerfdiff.results.intervals import Bootstrap, Estimate
 
 BOOTSTRAP = Bootstrap(resamples=500, level=0.9, seed=3)
@@ -140,10 +150,30 @@ def test_tables_have_a_line_per_run_and_per_configuration(tmp_path):
     assert isinstance(runs_frame([]), pd.DataFrame) and configurations_frame([]).empty
 
 
-def test_damaged_scores_are_named(tmp_path):
+def test_damaged_scores_are_told_and_the_rows_count(tmp_path):
     write_scores(tmp_path / "run", "ngd", {"a": "many"})
-    with pytest.raises(DataError, match=r"run/scores/ngd/per_scene\.csv: cannot be read \(could not convert"):
-        configurations(runs_of(tmp_path, result(folder="run")), BOOTSTRAP)
+    told = []
+    (found,) = configurations(runs_of(tmp_path, result(folder="run")), BOOTSTRAP, told.append)
+    assert found.estimates["psnr"] == (22.0, None, None)
+    assert re.search(r"run/scores/ngd/per_scene\.csv: cannot be read \(could not convert", *told)
+
+
+def test_files_of_a_run_lie_within_the_results(tmp_path):
+    """Wherever its row says that they are, and wherever links lead."""
+    results, outside = tmp_path / "results", tmp_path / "outside"
+    write_scores(outside, "ngd", {"a": 1.0})
+    write_scores(results / "sub" / "run", "ngd", {"a": 2.0})
+    (results / "link").symlink_to(outside)
+    (results / "loop").symlink_to(results / "loop")
+    own = ("scores", "ngd", "per_scene.csv")
+    for folder in ("../outside", str(outside), "link", "loop", "run/../../outside", "\0", "x" * 5000, "gone"):
+        run = Run(result(folder=folder), results)
+        assert run.file() is None and run.file(*own) is None
+        assert run.astray == (folder in ("../outside", str(outside), "link"))
+    assert Run(result(folder="sub/run"), results).file(*own) == results / "sub" / "run" / Path(*own)
+    assert Run(result(folder="sub/run"), results).file("..", "..", "..", "outside") is None
+    # where both are results, one may name the other
+    assert Run(result(folder="../../outside"), results / "sub", (tmp_path,)).file(*own) is not None
 
 
 def test_results_are_found_at_any_depth_but_not_among_predictions(tmp_path):

@@ -3,15 +3,19 @@ import fcntl
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
 from nerfdiff.errors import DataError
-from nerfdiff.results.row import ResultRow, append_row, flatten, read_rows, write_rows_csv
+from nerfdiff.results import row as rows_module
+from nerfdiff.results.row import COLUMNS, ResultRow, RowFile, append_row, flatten, read_rows
+from nerfdiff.results.text import write_csv
 
 SRC = Path(__file__).parents[2] / "src"
 CONTRACT = {
@@ -55,7 +59,7 @@ def test_non_finite_numbers_survive_in_valid_json(tmp_path):
 
 
 def test_the_schema_has_every_field_of_the_contract():
-    assert vars(row()).keys() >= CONTRACT
+    assert asdict(row()).keys() >= CONTRACT
 
 
 def test_unknown_status_is_refused():
@@ -63,27 +67,123 @@ def test_unknown_status_is_refused():
         row(status="fine")
 
 
-def test_rows_of_another_schema_version_are_refused(tmp_path):
+def test_a_file_of_another_schema_alone_is_refused_and_single_rows_are_skipped(tmp_path):
     path = tmp_path / "results.jsonl"
-    append_row(path, row())
     append_row(path, row(schema_version=1))
-    with pytest.raises(DataError, match=r"results\.jsonl, line 2: schema version 1, this program reads 2"):
+    with pytest.raises(DataError, match=r"results\.jsonl: 1 line .* line 1: schema version 1, this program reads 2"):
         read_rows(path)
+    append_row(path, row())
+    file = RowFile(path)
+    assert len(file.read()) == 1 and file.skipped.lines == 1 and "line 1: schema version 1" in str(file.skipped)
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ('{"schema_version": 2, "run', "line 1: not JSON"),
-        ("[1]", "schema version None"),
-        ('{"schema_version": 2, "run_id": "x", "psnrr": 3}', "unknown fields psnrr"),
-        ('{"schema_version": 2}', "run_id"),
-    ],
-)
-def test_damaged_lines_are_named(tmp_path, line, message):
-    (tmp_path / "results.jsonl").write_text(line + "\n")
-    with pytest.raises(DataError, match=message):
-        read_rows(tmp_path / "results.jsonl")
+def line_with(**values):
+    return json.dumps(asdict(row()) | values)
+
+
+DAMAGED = {
+    '{"schema_version": 2, "run': "not JSON",
+    "\0" * 4096: "not JSON",
+    "[1]": "not a JSON object",
+    '{"schema_version": 2, "run_id": "x", "psnrr": 3}': "unknown fields 'psnrr'",
+    '{"schema_version": 2}': "no run_id",
+    "[" * 100_000: "nested too deep",
+    '{"a":' * 100_000: "nested too deep",
+    "7" * 10_000: "not JSON",
+    line_with(psnr="high"): "psnr is to be a number below 1e\\+100, it is 'high'",
+    line_with(psnr=True): "psnr is to be",
+    line_with(psnr=1e300): "psnr is to be",
+    line_with(psnr=10**400): "psnr is to be",
+    line_with(n_views=2.5): "n_views is to be a whole number",
+    line_with(n_views=-1): "n_views is to be a whole number, not negative",
+    line_with(params=2**64): "params is to be",
+    line_with(seed="0"): "seed is to be",
+    line_with(strategy=["ngd"]): "strategy is to be text",
+    line_with(overrides="a=1"): "overrides is to be a list",
+    line_with(overrides=[1]): "overrides is to be a list",
+    line_with(overrides=["a=1"] * 1001): "overrides is to be a list of at most 1000",
+    line_with(image_size=[1, 2, 3]): "image_size is to be a height and a width",
+    line_with(scene_s=3.0): "scene_s is to be a timing",
+    line_with(scene_s={"n": 1, "median": 1.0}): "scene_s is to be a timing",
+    line_with(scene_s={"n": 1, "median": "x", "iqr": 0}): "scene_s is to be a timing",
+    line_with(status="fine"): "status 'fine' is unknown",
+    line_with(run_id=None): "no run_id",
+    line_with(compile=1): "compile is to be true or false",
+}
+
+
+@pytest.mark.parametrize("line", DAMAGED, ids=range(len(DAMAGED)))
+def test_a_line_that_is_no_row_costs_no_other_and_is_told(tmp_path, caplog, line):
+    path = tmp_path / "results.jsonl"
+    append_row(path, row(run_id="before"))
+    with open(path, "a") as file:
+        file.write(line + "\n")
+    append_row(path, row(run_id="after"))
+    file = RowFile(path)
+    assert [r.run_id for r in file.read()] == ["before", "after"]
+    assert file.skipped.lines == 1 and re.search(f"line 2: {DAMAGED[line]}", str(file.skipped))
+    assert caplog.messages == [str(file.skipped)] and len(caplog.messages[0]) < 500
+
+
+def test_many_lines_that_are_no_rows_are_counted_and_the_first_told(tmp_path):
+    path = tmp_path / "results.jsonl"
+    path.write_bytes(b"\xff\xfe\n" * 50 + line_with().encode() + b'\n{"torn')
+    file = RowFile(path)
+    assert len(file.read()) == 1 and file.skipped.lines == 51
+    assert re.search(r"51 lines are no rows .* line 1: .*; line 52: not JSON.*; and 47 more", str(file.skipped))
+
+
+def test_a_very_long_line_is_skipped_and_never_in_memory(tmp_path, monkeypatch):
+    path = tmp_path / "results.jsonl"
+    long = line_with(error="x" * 10_000)
+    path.write_text(f"{line_with(run_id='before')}\n{long}\n{line_with(run_id='after')}\n{long}")
+    assert len(read_rows(path)) == 4
+    monkeypatch.setattr(rows_module, "LONGEST", 4096)
+    file = RowFile(path)
+    assert [r.run_id for r in file.read()] == ["before", "after"]
+    assert file.skipped.lines == 2 and "line 2: longer than 4096 bytes; line 4: longer" in str(file.skipped)
+
+
+def test_what_a_writer_adds_is_read_once(tmp_path, monkeypatch):
+    path = tmp_path / "results.jsonl"
+    append_row(path, row(run_id="1"))
+    file = RowFile(path)
+    (first,) = file.read()
+    append_row(path, row(run_id="2"))
+    parsed = []
+    parse = rows_module._parse
+    monkeypatch.setattr(rows_module, "_parse", lambda line, words: parsed.append(line) or parse(line, words))
+    assert [r.run_id for r in file.read()] == ["1", "2"] and file.rows[0] is first and len(parsed) == 1
+    line = line_with(run_id="3")
+    with open(path, "a") as half:  # by somebody who does not lock
+        half.write(line[:50])
+    assert len(file.read()) == 2 and file.skipped.lines == 1
+    with open(path, "a") as half:
+        half.write(line[50:])
+    assert [r.run_id for r in file.read()] == ["1", "2", "3"] and file.skipped.lines == 0
+    path.write_text(line_with(run_id="edited") + "\n")
+    assert [r.run_id for r in file.read()] == ["edited"]
+
+
+def test_what_no_file_can_hold_is_replaced(tmp_path):
+    path = tmp_path / "results.jsonl"
+    path.write_text(line_with(error="half \ud800 a pair, whole \U0001f600", overrides=["x=\udc00"]))
+    (back,) = read_rows(path)
+    assert (back.error, back.overrides) == ("half ? a pair, whole \U0001f600", ["x=?"])
+
+
+def test_a_row_that_is_written_can_be_read(tmp_path):
+    append_row(tmp_path / "results.jsonl", row(error="\U0001f600" * 100_000))
+    (back,) = read_rows(tmp_path / "results.jsonl")
+    assert back.error == "\U0001f600" * rows_module.LONGEST_ERROR
+
+
+def test_a_pipe_or_a_folder_is_no_file_of_results(tmp_path):
+    os.mkfifo(tmp_path / "results.jsonl")
+    (tmp_path / "folder.jsonl").mkdir()
+    for name in ("results", "folder"):
+        with pytest.raises(DataError, match=rf"{name}\.jsonl: it is not a file"):
+            read_rows(tmp_path / f"{name}.jsonl")
 
 
 def test_a_missing_file_is_named(tmp_path):
@@ -157,7 +257,7 @@ def test_csv_has_one_scalar_per_column(tmp_path):
     flat = flatten(rows[0])
     assert flat["encode_s_n"] == 3 and flat["encode_s_median"] == 0.25 and "encode_s" not in flat
     assert flat["overrides"] == "model=tiny seed=1"
-    write_rows_csv(tmp_path / "results.csv", rows)
+    write_csv(tmp_path / "results.csv", COLUMNS, map(flatten, rows))
     with open(tmp_path / "results.csv", newline="") as file:
         first, second = csv.DictReader(file)
     assert first["psnr"] == "21.5" and first["encode_s_iqr"] == "0.01"

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+import os
 
 import numpy as np
 import pytest
@@ -14,13 +15,13 @@ from rich.console import Console
 from nerfdiff.errors import ConfigError, DataError
 from nerfdiff.evaluation import measure
 from nerfdiff.metrics.predictions import FORMAT
-from nerfdiff.results import sweep_grid, sweep_orbits
+from nerfdiff.results import sweep_grid, sweep_orbits, sweep_table
 from nerfdiff.results.hashes import sha256_values
 from nerfdiff.results.intervals import Bootstrap
 from nerfdiff.results.row import ResultRow, append_row, read_rows
 from nerfdiff.results.sweep_frontier import Frontier
-from nerfdiff.results.sweep_jobs import counterpart, group, jobs_of, planned
-from nerfdiff.results.sweep_lines import lines_of, read_scenes
+from nerfdiff.results.sweep_jobs import Job, counterpart, group, jobs_of, planned
+from nerfdiff.results.sweep_lines import lines_of, read_scores
 from nerfdiff.results.sweep_table import SweepTable
 from nerfdiff.results.sweep_text import to_csv, to_markdown, to_rich
 
@@ -196,13 +197,91 @@ def test_csv_and_terminal_show_every_line(swept):
     assert "no [bold] memory \\| left" in to_markdown(found)
 
 
-def test_damaged_scores_are_named(tmp_path):
+@pytest.mark.parametrize("damage", ["", "many", "gone", "pipe", "outside"])
+def test_damaged_scores_cost_their_intervals_and_no_other_line(swept, tmp_path, damage):
+    path = tmp_path / "ngd-seed0" / "ngd-1234" / "scores" / "ngd" / "per_scene.csv"
+    scores = path.read_text()
+    path.unlink()
+    if damage == "pipe":
+        os.mkfifo(path)
+    elif damage == "outside":
+        (tmp_path.parent / f"{tmp_path.name}.csv").write_text(scores)
+        path.symlink_to(tmp_path.parent / f"{tmp_path.name}.csv")
+    elif damage != "gone":
+        path.write_text(f"scene,views,blank,psnr\na,3,0,{damage}\0\n" if damage else scores)
+    none, _, ngd = lines(swept)
+    assert none.metrics["psnr"].mean == 22 and ngd.metrics["psnr"].mean == 23.5
+    if damage:
+        assert "per_scene.csv" in ngd.error and "without intervals over scenes" in ngd.error and not ngd.scenes
+        assert ngd.metrics["psnr"] == (23.5, 23.5, 23.5) and not ngd.differences
+    else:
+        assert ngd.error is None and ngd.scenes == 2
+
+
+def test_scores_that_are_no_numbers_stay_so(tmp_path):
     path = tmp_path / "per_scene.csv"
-    path.write_text("scene,views,blank,psnr\na,3,0,many\n")
-    with pytest.raises(DataError, match=r"per_scene\.csv"):
-        read_scenes(path)
     path.write_text("scene,views,blank,psnr,ssim\na,3,0,nan,\n")
-    assert math.isnan(read_scenes(path)["psnr"]["a"]) and "ssim" not in read_scenes(path)
+    assert math.isnan(read_scores(path)["a"]["psnr"]) and "ssim" not in read_scores(path)["a"]
+    path.write_text("scene,psnr\n" + "a,1\n" * 2**19)
+    with pytest.raises(DataError, match="bytes are too many"):
+        read_scores(path)
+
+
+@pytest.mark.parametrize("folder", ["../outside", "/tmp", "", None, "x\0y", "x" * 5000])
+def test_a_job_has_nothing_outside_of_its_sweep(tmp_path, folder):
+    (tmp_path / "outside" / "predictions" / "ngd").mkdir(parents=True)
+    job = Job(("strategy=ngd",), ResultRow(run_id="x", strategy="ngd", folder=folder), tmp_path / "sweep")
+    (tmp_path / "sweep").mkdir()
+    with pytest.raises(DataError, match="is not there, or outside of the sweep's folder"):
+        job.own("predictions")
+
+
+def test_lines_that_are_no_rows_are_told_below_the_table(swept, tmp_path, capsys, monkeypatch):
+    with open(tmp_path / "results.jsonl", "a") as file:
+        file.write('{"torn\n[2]\n')
+    monkeypatch.setattr(SweepTable, "_pictures", lambda *arguments: "none")
+    callback = table()
+    callback.on_multirun_start(swept)
+    callback.on_multirun_end(OmegaConf.create())
+    assert "2 lines are no rows and were skipped: line 6: not JSON" in (tmp_path / "table.md").read_text()
+    assert "2 lines are no rows and were skipped" in " ".join(capsys.readouterr().out.split())
+    assert len(list(csv.DictReader(io.StringIO((tmp_path / "table.csv").read_text())))) == 3
+
+
+@pytest.mark.parametrize(("error", "words"), [(DataError("no space"), "no space"), (KeyError("x"), "KeyError: 'x'")])
+def test_a_sweep_that_wrote_no_table_fails(swept, monkeypatch, error, words):
+    def write(*arguments):
+        raise error
+
+    monkeypatch.setattr(sweep_table, "write_text", write)
+    callback = table()
+    callback.on_multirun_start(swept)
+    callback.on_job_end(swept, JobReturn(status=JobStatus.COMPLETED)) if isinstance(error, DataError) else None
+    with pytest.raises(SystemExit, match=f"this sweep's table could not be written: {words}"):
+        callback.on_multirun_end(OmegaConf.create())
+
+
+def test_pictures_that_cannot_be_made_cost_no_table(swept, tmp_path, monkeypatch, caplog):
+    def grid(*arguments):
+        raise RuntimeError("no decoder")
+
+    monkeypatch.setattr(sweep_grid, "grid", grid)
+    callback = table()
+    callback.on_multirun_start(swept)
+    callback.on_multirun_end(OmegaConf.create())
+    assert "no decoder" in caplog.text and (tmp_path / "table.md").is_file()
+
+
+def test_what_rows_say_is_text_everywhere(swept, tmp_path):
+    words = "[/bold] `x` <img src=x> [a](javascript:x) ${1} \x1b[2J a\nb | *c*"
+    overrides = ["seed=1", "strategy=sds", "ckpt=demo"]
+    append_row(tmp_path / "results.jsonl", ResultRow(run_id="x", overrides=overrides, status="error", error=words))
+    found = lines(swept)
+    console = Console(file=io.StringIO(), width=300)
+    console.print(to_rich(found))
+    assert "[/bold] `x` <img src=x> [a](javascript:x) ${1}  [2J a b | *c*" in console.file.getvalue()
+    text = to_markdown(found)
+    assert "[/bold] \\`x\\` &lt;img src=x> [a]\\(javascript:x) ${1}  [2J a b \\| \\*c\\*" in text and "\x1b" not in text
 
 
 def table(frontier=None, pause=0.0):

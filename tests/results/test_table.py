@@ -1,5 +1,6 @@
 import io
 
+import pytest
 from rich.console import Console
 
 from nerfdiff.results.row import ResultRow
@@ -42,6 +43,17 @@ def test_rich_and_markdown_show_the_same(tmp_path):
         assert text in printed
     write_markdown(tmp_path / "table.md", ROWS)
     assert (tmp_path / "table.md").read_text() == markdown(ROWS)
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_names_with_brackets_are_no_markup(rows):
+    found = [
+        ResultRow(run_id=str(n), strategy="s[bold]", dataset="x[/bold]/test", weights="\x1b[2Jw") for n in range(rows)
+    ]
+    console = Console(file=io.StringIO(), width=120)
+    console.print(rich_table(found, 120, title="of x[/bold]"))
+    text = console.file.getvalue()
+    assert all(word in text for word in ("s[bold]", "x[/bold]/test", " [2Jw", "of x[/bold]")) and "\x1b" not in text
 
 
 def test_a_narrow_table_keeps_whole_columns_and_names_the_others():

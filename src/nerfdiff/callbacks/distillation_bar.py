@@ -7,14 +7,14 @@ from lightning import Callback, LightningModule, Trainer
 
 
 class DistillationBar(Callback):
-    """Says t and how well the fields' renderings agree with their targets.
+    """Says the step, t, and how well the fields' renderings agree with their targets.
 
     Args:
-        tell: receives the words.
+        tell: receives the share of the steps that are done, and the words.
         every: seconds between words: to say them, the host waits for the device.
     """
 
-    def __init__(self, tell: Callable[[str], None], every: float = 0.5):
+    def __init__(self, tell: Callable[[float, str], None], every: float):
         self.tell, self.every = tell, every
         self._told = -float("inf")
 
@@ -22,7 +22,8 @@ class DistillationBar(Callback):
         if time.monotonic() - self._told < self.every:
             return
         t, agreement = pl_module.progress()
-        where = f"step {batch_idx + 1}" if t is None else f"t {t:.2f}"
-        reached = "–" if agreement is None else f"{agreement:.1f} dB"
-        self.tell(f"{where}, renders against targets {reached}")
+        step, steps = batch_idx + 1, pl_module.steps
+        where = f"step {step} of {steps}" + ("" if t is None else f", t {t:.2f}")
+        reached = "" if agreement is None else f", renders against targets {agreement:.1f} dB"
+        self.tell(step / steps, where + reached)
         self._told = time.monotonic()

@@ -34,6 +34,11 @@ class NonFiniteGuard(Callback):
         self.stability = Stability(spike, memory)
         self._loss: Tensor | float = 0.0
 
+    @property
+    def upset(self) -> int:
+        """Steps in a row, up to the last, that went wrong, see `Stability`."""
+        return self.stability.upset
+
     def on_before_backward(self, trainer: Trainer, pl_module: LightningModule, loss: Tensor) -> None:
         self._loss = self._loss + loss.detach()  # of one step's accumulated batches, each its share
 
@@ -60,7 +65,7 @@ class NonFiniteGuard(Callback):
         if self.in_a_row >= self.patience:
             raise TrainingDiverged(
                 f"gradients were not finite for {self.in_a_row} steps in a row, up to step {trainer.global_step}. "
-                "The last checkpoint is from before and is kept. Lower optimizer.lr, or use trainer.precision=32-true"
+                "Lower optimizer.lr, or use trainer.precision=32-true"
             )
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Averages of the weights whose length is chosen after training (Karras et al. 2024, EDM2, arXiv 2312.02696, section 3).
+"""Averages of the weights whose length is chosen after training (Karras et al. 2024, EDM2, arXiv 2312.02696, sec. 3).
 
 Two averages with power-function profiles are kept while training runs, and saved from time to time. Any average of the
 family, up to any saved step, is then a weighted sum of the snapshots (their eq. 135 and algorithm 3).
@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -30,7 +30,7 @@ class Snapshots(Callback):
     Args:
         folder: of the files.
         every_n_steps: optimizer steps from one snapshot to the next; the last step is always one.
-        lengths: relative standard deviations σ_rel of the averages, as shares of the training so far (EDM2: 0.05, 0.10).
+        lengths: relative standard deviations σ_rel of the averages, shares of the training so far (EDM2: 0.05, 0.1).
 
     Raises:
         ConfigError: a length that no average has.
@@ -101,9 +101,12 @@ def products(
     """Inner products of normalised profiles (γ + 1) τ^γ / t^(γ+1) on [0, t]: of each row's with each column's."""
     (t, g), (u, h) = (x[:, None] for x in (steps, exponents)), (x[None] for x in (other_steps, other_exponents))
     shorter = np.minimum(t, u)
-    return (g + 1) * (h + 1) * np.exp(
-        (g + h + 1) * np.log(shorter) - (g + 1) * np.log(t) - (h + 1) * np.log(u)
-    ) / (g + h + 1)
+    return (
+        (g + 1)
+        * (h + 1)
+        * np.exp((g + h + 1) * np.log(shorter) - (g + 1) * np.log(t) - (h + 1) * np.log(u))
+        / (g + h + 1)
+    )
 
 
 def combination(
@@ -124,14 +127,19 @@ def average_of(folder: str | Path, length: float, step: int | None = None) -> Ma
     """The average of `length`, up to `step` (None: the last), from a run's snapshots; fp32.
 
     Raises:
-        CheckpointError: there are no snapshots, or none up to that step.
+        CheckpointError: there are no snapshots, none up to that step, or one is damaged.
         ConfigError: no average has that length.
     """
     found = []
     for path in sorted(Path(folder).glob("step_*.safetensors")):
-        with safe_open(path, "pt") as file:
-            about = file.metadata()
-        found.append((int(about["step"]), float(about["length"]), path))
+        try:
+            with safe_open(path, "pt") as file:
+                about = file.metadata()
+            found.append((int(about["step"]), float(about["length"]), path))
+        except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+            raise CheckpointError(
+                f"{path} is not a readable snapshot ({error!r}); delete it to go without it"
+            ) from error
     steps = sorted({known for known, _, _ in found})
     if not found or (step is not None and step not in steps):
         raise CheckpointError(f"{folder} has no snapshots{f' of step {step}' if found else ''}; it has steps {steps}")

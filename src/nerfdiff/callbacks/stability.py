@@ -10,6 +10,8 @@ _BINS = 32
 class Stability:
     """Counts steps without a usable gradient and jumps of the loss, and knows the gradient norms' distribution.
 
+    `upset` is how many steps in a row, up to the last, went wrong: no usable gradient or loss, or a jump of the loss.
+
     Args:
         spike: a loss this many times the running mean is one.
         memory: steps over which that mean forgets; as many pass before any spike is counted.
@@ -17,12 +19,14 @@ class Stability:
 
     def __init__(self, spike: float, memory: int):
         self.spike, self.memory = spike, memory
-        self.nonfinite = self.spikes = self.steps = 0
+        self.nonfinite = self.spikes = self.steps = self.upset = 0
         self._mean = math.nan
         self._norms: dict[int, int] = {}
 
     def add(self, norm: float, loss: float) -> None:
         """One optimizer step's gradient norm, before clipping, and its loss."""
+        far = self.steps > 0 and 0 < self.spike * self._mean < loss
+        self.upset = 0 if math.isfinite(norm) and math.isfinite(loss) and not far else self.upset + 1
         if not math.isfinite(norm):
             self.nonfinite += 1
         elif norm > 0:
@@ -30,10 +34,9 @@ class Stability:
             self._norms[number] = self._norms.get(number, 0) + 1
         if not math.isfinite(loss):
             return
-        jump = self.steps >= self.memory and loss > self.spike * self._mean
-        self.spikes += jump
+        self.spikes += far and self.steps >= self.memory
         # a spike moves the mean little, so that the next is still seen as one
-        loss = min(loss, self.spike * self._mean) if jump else loss
+        loss = self.spike * self._mean if far else loss
         self.steps += 1
         share = 1 / min(self.steps, self.memory)
         self._mean = loss if self.steps == 1 else (1 - share) * self._mean + share * loss
@@ -56,9 +59,10 @@ class Stability:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        counts = {"nonfinite": self.nonfinite, "spikes": self.spikes, "steps": self.steps}
+        counts = {"nonfinite": self.nonfinite, "spikes": self.spikes, "steps": self.steps, "upset": self.upset}
         return counts | {"mean": self._mean, "norms": dict(self._norms)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.nonfinite, self.spikes, self.steps = state["nonfinite"], state["spikes"], state["steps"]
         self._mean, self._norms = state["mean"], dict(state["norms"])
+        self.upset = state.get("upset", 0)  # not in runs that were begun before it was recorded

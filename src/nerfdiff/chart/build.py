@@ -1,6 +1,7 @@
 """Results to a page, pictures and tables."""
 
 import logging
+import os
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,20 +14,23 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from nerfdiff.chart.page import write_page
 from nerfdiff.chart.payload import Measured, configuration_values, failure_values, failures, measured, share_words
-from nerfdiff.chart.pictures import small_sheets
+from nerfdiff.chart.pictures import SmallSheets
 from nerfdiff.chart.png import write_png
 from nerfdiff.chart.published import published_for
+from nerfdiff.cli import command_words
 from nerfdiff.errors import ConfigError, DataError
-from nerfdiff.results.files import write_text
 from nerfdiff.results.frame import (
+    CONFIGURATION_COLUMNS,
     RESULTS,
     Run,
+    configuration_line,
     configurations,
-    configurations_frame,
     find_results,
     read_runs,
-    runs_frame,
+    run_lines,
 )
+from nerfdiff.results.row import COLUMNS, RowFile
+from nerfdiff.results.text import one_line, write_csv
 
 log = logging.getLogger(__name__)
 
@@ -42,11 +46,15 @@ HOW = (
 
 @dataclass
 class Found:
-    """Runs of all files of results, and what was wrong with the others."""
+    """Runs of all files of results, and what is not shown of what else was there."""
 
     runs: list[Run] = field(default_factory=list)
     files: int = 0
     unread: list[str] = field(default_factory=list)
+
+    def warn(self, text: str) -> None:
+        log.warning("%s", one_line(text))
+        self.unread.append(text)
 
 
 def build_chart(cfg: DictConfig) -> Path:
@@ -59,21 +67,27 @@ def build_chart(cfg: DictConfig) -> Path:
         the page's path.
 
     Raises:
-        DataError: there is no such file or folder; a file of results or scores is damaged or of another schema (files
-            found within a folder are named on the page instead, as long as others can be read).
+        DataError: there is no such file or folder, or a file of results has no row that can be read (of files found
+            within a folder the page says so instead, as long as others can be read; as it does of single lines).
         ConfigError: published values are inconsistent.
     """
     places = _places(cfg.results)
     found = _read(places)
+    if astray := sum(run.astray for run in found.runs):
+        found.warn(
+            f"{astray} of {len(found.runs)} runs say that their folders lie outside of these results: "
+            "nothing is shown from there (results= takes several folders)"
+        )
     out = Path(cfg.out) if cfg.out is not None else _folder(places[0]) / "chart"
     metrics, costs = _plain(cfg.metrics), _plain(cfg.costs)
     bootstrap = instantiate(cfg.bootstrap)
-    content = measured(configurations(found.runs, bootstrap), metrics, costs, cfg.unnamed)
+    content = measured(configurations(found.runs, bootstrap, found.warn), metrics, costs, cfg.unnamed)
     published = [published_for(panel, **_plain(cfg.published)) for panel in content.panels]
     failed = failures(found.runs)
 
-    page, table = out / "index.html", configurations_frame(content.found)
-    values = _values(cfg, out, content, published, failed)
+    page = out / "index.html"
+    small = SmallSheets(**_plain(cfg.pictures), warn=found.warn)
+    values = _values(out, content, published, failed, small)
     counts = f"{len(found.runs)} runs, {len(content.found)} configurations, {len(failed)} failed runs"
     write_page(
         page,
@@ -89,8 +103,8 @@ def build_chart(cfg: DictConfig) -> Path:
             "empty": _nothing(places, found, len(content.found)),
         },
     )
-    write_text(out / "configurations.csv", table.to_csv(index=False))
-    write_text(out / "runs.csv", runs_frame(found.runs).to_csv(index=False))
+    write_csv(out / "configurations.csv", CONFIGURATION_COLUMNS, map(configuration_line, content.found))
+    write_csv(out / "runs.csv", ("results", *COLUMNS), run_lines(found.runs))
     pictures = _pngs(cfg, out, content, published)
     log.info("page: %s   beside it: configurations.csv, runs.csv and %d PNGs", page, len(pictures))
     return page
@@ -113,19 +127,25 @@ def _folder(place: Path) -> Path:
 
 def _read(places: Sequence[Path]) -> Found:
     found, first, seen = Found(), None, set()
+    roots = tuple(map(_folder, places))
     for place in places:
-        for path in find_results(place):
-            if (file := path.resolve()) in seen:
+        for path in find_results(place, lambda error: found.warn(f"left out: {error.filename}: {error.strerror}")):
+            if (real := Path(os.path.realpath(path))) in seen:
                 continue
-            seen.add(file)
+            seen.add(real)
+            file = RowFile(path)
             try:
-                found.runs += read_runs(path)
+                runs = read_runs(file, roots)
+                if file.skipped.lines and not runs:
+                    raise DataError(str(file.skipped))
+                found.runs += runs
                 found.files += 1
+                if file.skipped.lines:  # the reader has warned of them
+                    found.unread.append(str(file.skipped))
             except DataError as error:
                 if path == place:
                     raise
-                log.warning("left out: %s", error)
-                found.unread.append(f"left out: {error}")
+                found.warn(f"left out: {error}")
                 first = first or error
     if first is not None and not found.files:
         raise first
@@ -139,18 +159,21 @@ def _nothing(places: Sequence[Path], found: Found, configurations: int) -> str |
     where = " and ".join(map(str, places))
     if found.runs:
         return f"All {len(found.runs)} runs in {where} failed; why is below."
-    example = shlex.join(["python", "src/distill.py", "sweep=speed_accuracy", "ckpt=demo", "budget=minutes"])
+    example = shlex.join([*command_words("distill"), "sweep=speed_accuracy", "ckpt=demo", "budget=minutes"])
     return (
         f"There are no results in {where} yet: evaluations, distillations and sweeps leave a {RESULTS}, as in {example}"
     )
 
 
 def _values(
-    cfg: DictConfig, out: Path, content: Measured, published: Sequence[list[dict[str, Any]]], failed: Sequence[Run]
+    out: Path,
+    content: Measured,
+    published: Sequence[list[dict[str, Any]]],
+    failed: Sequence[Run],
+    small: SmallSheets,
 ) -> dict[str, Any]:
     shown = [configuration_values(content, number, out) for number in range(len(content.found))]
-    small = small_sheets((each.runs[0] for each in content.found), cfg.pictures.width, cfg.pictures.megabytes)
-    for entry, sheet in zip(shown, small, strict=True):
+    for entry, sheet in zip(shown, small.of(each.runs[0] for each in content.found), strict=True):
         entry["small"] = sheet
     lost = [failure_values(run) for run in failed]
     panels = [
@@ -176,6 +199,6 @@ def _pngs(cfg: DictConfig, out: Path, content: Measured, published: Sequence[lis
             for cost in cfg.png.costs:
                 if content.points(panel, metric["field"], cost):
                     path = out / f"{metric['field']}-{cost}{f'-{number}' * (number > 1)}.png"
-                    png = (path, content, panel, metric, costs[cost], entries, cfg.png.size, cfg.png.dpi)
+                    png = (path, content, panel, metric, costs[cost], entries, cfg.png.size, cfg.png.dpi, cfg.png.lines)
                     written.append(write_png(*png))
     return written

@@ -1,7 +1,7 @@
 """How configurations are called: by the settings in which they differ."""
 
 from collections import Counter
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 
 from nerfdiff.results.frame import Configuration
 
@@ -15,6 +15,7 @@ SETTLED_BY = {
 }  # fmt: skip
 """Overrides which say what a field of the row says, and more."""
 DIGITS = 8  # of a digest
+PARTS = 16  # of a key or path at most, before the whole is told
 ROW = "row."
 CKPT = "ckpt"  # the one path that is told
 RUN = ROW + "run_id"  # where nothing else differs
@@ -47,23 +48,43 @@ def labels_of(found: Sequence[Configuration], unnamed: Sequence[str]) -> list[Se
 
 def names_of(labels: Sequence[Settings]) -> list[str]:
     """For each configuration of a panel its strategy, and as few labels as no other of that strategy has all."""
-    having: dict[tuple[str, str, str], int] = {}  # per strategy, key and value: a bit for each that has it
+    alike: dict[str, list[int]] = {}
     for number, values in enumerate(labels):
-        for item in values.items():
-            having[values["strategy"], *item] = having.get((values["strategy"], *item), 0) | 1 << number
-    names = []
-    for values in labels:
-        strategy, left = values["strategy"], [item for item in values.items() if item[0] != "strategy"]
-        alike, told = having[strategy, "strategy", strategy], []
-        while left and alike.bit_count() > 1:
-            told.append(min(left, key=lambda item: (alike & having[strategy, *item]).bit_count()))
-            left.remove(told[-1])
-            alike &= having[strategy, *told[-1]]
-        short = _shortened(values, ".")
-        names.append(
-            " ".join([strategy, *(f"{short[key]}={values[key]}" for key in values if (key, values[key]) in told)])
-        )
+        alike.setdefault(values["strategy"], []).append(number)
+    names = [""] * len(labels)
+    for strategy, members in alike.items():
+        for number, told in _told_of(members, labels):
+            short = _shortened(labels[number], ".")
+            words = [f"{short[key]}={value}" for key, value in labels[number].items() if key in told]
+            names[number] = " ".join([strategy, *words])
     return names
+
+
+def _told_of(members: Sequence[int], labels: Sequence[Settings]) -> Iterator[tuple[int, set[str]]]:
+    """For each member the labels to tell: that which fewest share with it, and so on among these.
+
+    Members go through it together as long as they tell the same, so that each is counted a few times in all.
+    """
+    groups: list[tuple[list[int], list[int], set[str]]] = [(list(members), list(members), {"strategy"})]
+    while groups:
+        asking, among, told = groups.pop()
+        if len(among) == 1:
+            yield from ((number, told - {"strategy"}) for number in asking)
+            continue
+        counts = Counter((key, value) for number in among for key, value in labels[number].items() if key not in told)
+        chosen: dict[tuple[str, str], list[int]] = {}
+        for number in asking:
+            left = [item for item in labels[number].items() if item[0] not in told]
+            if left:
+                chosen.setdefault(min(left, key=counts.__getitem__), []).append(number)
+            else:
+                yield number, told - {"strategy"}
+        having: dict[tuple[str, str], list[int]] = {item: [] for item in chosen}
+        for number in among:
+            for item in labels[number].items():
+                if item in having:
+                    having[item].append(number)
+        groups += [(own, having[item], told | {item[0]}) for item, own in chosen.items()]
 
 
 def _settings(configuration: Configuration) -> Settings:
@@ -131,15 +152,13 @@ def _numbers(values: Iterable[Hashable]) -> tuple[int, ...]:
 
 
 def _shortened(words: Iterable[str], separator: str) -> dict[str, str]:
-    """Each word by its last part, with as many before it as it takes to be the only one."""
+    """Each word by its last part, with as many before it as it takes to be the only one; the whole if it takes many."""
     short = {word: word.rstrip(separator).rsplit(separator, 1)[-1] for word in words}
-    while clashing := [name for name, count in Counter(short.values()).items() if count > 1]:
-        longer = {
-            word: separator.join(word.split(separator)[-name.count(separator) - 2 :])
-            for word, name in short.items()
-            if name in clashing
-        }
-        if all(short[word] == name for word, name in longer.items()):
+    for parts in range(2, PARTS + 2):
+        counts = Counter(short.values())
+        clashing = [word for word, name in short.items() if counts[name] > 1 and name != word]
+        if not clashing:
             break
-        short |= longer
+        for word in clashing:
+            short[word] = word if parts > PARTS else separator.join(word.rsplit(separator, parts)[-parts:])
     return short

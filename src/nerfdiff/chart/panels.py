@@ -5,8 +5,10 @@ from dataclasses import dataclass
 
 from nerfdiff.results.frame import Configuration
 from nerfdiff.results.row import ResultRow
+from nerfdiff.results.text import one_line
 
 UNKNOWN = "device not recorded"
+LONGEST = 200  # letters of a name
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,8 @@ def _test(row: ResultRow) -> tuple:
 
 
 def _name(row: ResultRow) -> str:
+    name = one_line(row.dataset or "data not recorded", LONGEST)
     size = row.image_size and f"{'×'.join(map(str, row.image_size))} pixels"
     scenes = row.n_scenes and f"{row.n_scenes} scene{'s' * (row.n_scenes > 1)}"
     views = row.n_views and f"{row.n_views} views"
-    return ", ".join(filter(None, (row.dataset or "data not recorded", size, scenes, views)))
+    return ", ".join(filter(None, (name, size, scenes, views)))

@@ -3,7 +3,9 @@
 import base64
 import io
 import os
-from collections.abc import Iterable
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
@@ -15,47 +17,73 @@ WEBP_QUALITY = 70
 
 
 def links(run: Run, page: Path) -> dict[str, str]:
-    """Relative links from the page's folder to the run's contact sheet, orbit video and folder, of those that exist."""
-    if run.folder is None or not run.folder.is_dir():
+    """Relative links from the page's folder to the run's contact sheet, orbit video and folder, of those that exist.
+
+    What lies outside of the results is not linked, wherever the row says that it is.
+    """
+    if (folder := run.file()) is None or not folder.is_dir():
         return {}
-    found = {"folder": run.folder, "sheet": run.folder / "sheet.png", "orbit": _orbit(run)}
+    found = {"folder": folder, "sheet": run.file("sheet.png"), "orbit": _orbit(run)}
     # a path that is no URL yet: `#` and `?` would end it, and other drives have no relative path
     return {
-        name: quote(Path(os.path.relpath(path, page)).as_posix())
+        name: quote(os.fsencode(Path(os.path.relpath(path, page)).as_posix()))
         for name, path in found.items()
-        if path is not None and path.exists()
+        if path is not None
     }
 
 
 def _orbit(run: Run) -> Path | None:
     """Of the first scene, where the run has none of all."""
-    own = run.folder / "orbit.mp4"
-    if own.is_file():
+    predictions = run.file("predictions", str(run.row.strategy))
+    if (own := run.file("orbit.mp4")) is not None or predictions is None:
         return own
-    return next(iter(sorted((run.folder / "predictions" / str(run.row.strategy)).glob("*/orbit.mp4"))), None)
+    names = sorted(path.parent.name for path in predictions.glob("*/orbit.mp4"))
+    paths = (run.file("predictions", str(run.row.strategy), name, "orbit.mp4") for name in names)
+    return next((path for path in paths if path is not None), None)
 
 
-def small_sheets(runs: Iterable[Run], width: int, megabytes: float) -> list[str | None]:
-    """Contact sheets of `width` pixels at most as data URLs, until they take `megabytes` together; then None.
+@dataclass
+class SmallSheets:
+    """Contact sheets as data URLs, to carry within the page.
 
-    A sheet that is missing or damaged is None too: it is linked at best.
+    Args:
+        width: pixels that one has at most.
+        megabytes: that all have together at most; then there are no more.
+        megapixels: a larger picture is not opened.
+        warn: is told of sheets that cannot be shown.
     """
-    left = megabytes * 2**20
-    sheets: list[str | None] = []
-    for run in runs:
-        sheet = _small(run.folder / "sheet.png", width) if left > 0 and run.folder is not None else None
-        left -= len(sheet or "")
-        sheets.append(sheet if left > 0 else None)
-    return sheets
 
+    width: int
+    megabytes: float
+    megapixels: float
+    warn: Callable[[str], object]
 
-def _small(path: Path, width: int) -> str | None:
-    try:
-        with Image.open(path) as image:
-            image = image.convert("RGB")
-            image.thumbnail((width, 4 * width))
-            file = io.BytesIO()
-            image.save(file, "WEBP", quality=WEBP_QUALITY)
-    except OSError:
-        return None
-    return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
+    def of(self, runs: Iterable[Run]) -> list[str | None]:
+        """One per run; None where it is missing, damaged or too large, or there is no room: it is linked at best."""
+        left = self.megabytes * 2**20
+        sheets: list[str | None] = []
+        for run in runs:
+            path = run.file("sheet.png") if left > 0 else None
+            sheet = None if path is None else self._small(path)
+            left -= len(sheet or "")
+            sheets.append(sheet if left > 0 else None)
+        return sheets
+
+    def _small(self, path: Path) -> str | None:
+        try:
+            if not path.is_file():
+                raise OSError("it is no file")
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is looked at here
+                with Image.open(path, formats=("PNG",)) as image:
+                    width, height = image.size
+                    if width * height > self.megapixels * 1e6:
+                        raise OSError(f"{width}×{height} pixels are more than pictures.megapixels={self.megapixels:g}")
+                    image = image.convert("RGB")
+                    image.thumbnail((self.width, 4 * self.width))
+                    file = io.BytesIO()
+                    image.save(file, "WEBP", quality=WEBP_QUALITY)
+        except Exception as error:  # of whatever damage the decoder stumbles over
+            self.warn(f"{path}: not shown: {error}")
+            return None
+        return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()

@@ -1,5 +1,6 @@
 """The charts as PNGs, for where no page can be."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from textwrap import fill
@@ -14,10 +15,12 @@ from nerfdiff.chart.panels import Panel
 from nerfdiff.chart.payload import Measured
 from nerfdiff.results.files import atomic
 from nerfdiff.results.intervals import Estimate
+from nerfdiff.results.text import figure_text, one_line
 
 INK, PAPERS = "#1d2430", "#6b4a00"
 KINDS = ("#0b62b8", "#d1570a", "#1a8a5a", "#8a4fbf", "#b3261e", "#0f8fa3", "#8a6d1d", "#c2408f", "#5d8a00", "#5c6675")
 FAINT = 0.3
+LONGEST, SHORT = 400, 40  # letters of a name below the axes, and in the legend
 LINE, LETTERS = 0.16, 18  # inches of a line below the axes, and letters of it to an inch
 
 
@@ -30,6 +33,7 @@ def write_png(
     published: Sequence[Mapping[str, Any]],
     size: Sequence[float],
     dpi: int,
+    lines: int,
 ) -> Path:
     """One panel's chart of one metric against one cost, coloured by strategy; dominated points are faint.
 
@@ -38,6 +42,7 @@ def write_png(
     Args:
         published: of which those that have both numbers are drawn.
         size: inches, without these lines.
+        lines: at most so many points of the frontier are explained.
 
     Raises:
         DataError: the file cannot be written.
@@ -45,19 +50,20 @@ def write_png(
     best = content.frontiers[content.panels.index(panel)][metric["field"]][cost["field"]]
     points = content.points(panel, metric["field"], cost["field"])
     at = {n: (content.estimates[n][cost["field"]], content.estimates[n][metric["field"]]) for n in points}
-    told = [_told(number, content.names[n], at[n], metric, cost) for number, n in enumerate(best, 1)]
-    told = [fill(text, int(LETTERS * size[0]), subsequent_indent="    ") for text in told]
+    told = [_told(number, content.names[n], at[n], metric, cost) for number, n in enumerate(best[:lines], 1)]
+    if len(best) > lines:
+        told.append(f"and {len(best) - lines} more, in configurations.csv")
+    told = [figure_text(fill(text, int(LETTERS * size[0]), subsequent_indent="    ")) for text in told]
     height = size[1] + LINE * sum(text.count("\n") + 1 for text in told)
     figure = Figure(figsize=(size[0], height), dpi=dpi, layout="constrained")
     axes = figure.subplots()
     _scale(axes, [at[n][0].mean for n in points])
-    strategies = sorted({content.found[n].row.strategy or "?" for n in points})
-    colours = {strategy: KINDS[min(k, len(KINDS) - 1)] for k, strategy in enumerate(strategies)}
-    for strategy, colour in colours.items():
-        own = [n for n in points if (content.found[n].row.strategy or "?") == strategy]
-        _errorbars(axes, [at[n] for n in own if n not in set(best)], colour, FAINT)
-        _errorbars(axes, [at[n] for n in own if n in set(best)], colour, 1)
-    for number, n in enumerate(best, 1):
+    kinds = _kinds({n: content.found[n].row.strategy or "?" for n in points})
+    shown = set(best)
+    for (_, own), colour in zip(kinds, KINDS, strict=False):
+        _errorbars(axes, [at[n] for n in own if n not in shown], colour, FAINT)
+        _errorbars(axes, [at[n] for n in own if n in shown], colour, 1)
+    for number, n in enumerate(best[:lines], 1):
         place = (at[n][0].mean, at[n][1].mean)
         axes.annotate(str(number), place, (-5, 5), textcoords="offset points", ha="right", fontsize=8, color=INK)
     _published(axes, metric["field"], cost["field"], published)
@@ -67,14 +73,30 @@ def write_png(
     if metric["better"] == "lower":
         axes.invert_yaxis()
     axes.grid(alpha=0.25)
-    axes.set_title(f"{panel.device}: {panel.data}", fontsize=9)
-    dots = [Line2D([], [], color=colour, marker="o", ls="", label=strategy) for strategy, colour in colours.items()]
+    axes.set_title(figure_text(fill(one_line(f"{panel.device}: {panel.data}", LONGEST), int(12 * size[0]))), fontsize=9)
+    dots = [
+        Line2D([], [], color=colour, marker="o", ls="", label=figure_text(one_line(name, SHORT)))
+        for (name, _), colour in zip(kinds, KINDS, strict=False)
+    ]
     axes.legend(handles=dots, fontsize=7, loc="best")
     key = [Line2D([], [], ls="", label=text) for text in told]
     figure.legend(handles=key, loc="outside lower left", fontsize=7, frameon=False, handlelength=0, labelspacing=0.2)
-    with atomic(path) as temporary:
+    with atomic(path) as temporary, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a name in letters of another script
         FigureCanvasAgg(figure).print_png(temporary)
     return path
+
+
+def _kinds(strategies: Mapping[int, str]) -> list[tuple[str, list[int]]]:
+    """The points of each strategy, by name; where there are more than colours, the last kind has all others."""
+    members: dict[str, list[int]] = {}
+    for number, strategy in strategies.items():
+        members.setdefault(strategy, []).append(number)
+    kinds = sorted(members.items())
+    if len(kinds) > len(KINDS):
+        rest = kinds[len(KINDS) - 1 :]
+        kinds[len(KINDS) - 1 :] = [(f"{len(rest)} others", [number for _, own in rest for number in own])]
+    return kinds
 
 
 def _titled(quantity: Mapping[str, Any]) -> str:
@@ -89,7 +111,7 @@ def _told(
     cost: Mapping[str, Any],
 ) -> str:
     values = f"{point[1].mean:.{metric['digits']}f} {metric['unit']}".strip(), f"{point[0].mean:.3g} {cost['unit']}"
-    return f"{number}: {values[0]} at {values[1].strip()}: {name}"
+    return f"{number}: {values[0]} at {values[1].strip()}: {one_line(name, LONGEST)}"
 
 
 def _steps(axes: Axes, places: Sequence[tuple[float, float]]) -> None:

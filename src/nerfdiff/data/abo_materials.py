@@ -32,9 +32,10 @@ from nerfdiff.data.exr import read_exr
 from nerfdiff.data.framing import Framing
 from nerfdiff.data.index import cached_index, folder_stamp, index_name
 from nerfdiff.data.item_folders import item_folders
+from nerfdiff.data.masks import read_mask
 from nerfdiff.data.optical_axes import ObjectCameras, check_settings, object_cameras, report
 from nerfdiff.data.pinhole import check_K
-from nerfdiff.data.scene import MissingSplit, Scene
+from nerfdiff.data.scene import Listing, MissingSplit, Scene
 from nerfdiff.data.split_file import seeded_order
 from nerfdiff.data.view_stack import stack_pixels
 from nerfdiff.errors import ConfigError, DataError, some
@@ -148,22 +149,25 @@ class ABOMaterials:
         """All cameras of a scene as the file has them: what convention was found, and what they look at."""
         return self._geometry(index, MaterialViews.read(self.folders[index]))
 
+    def listing(self, index: int) -> Listing:
+        folder, stored = self.folders[index], MaterialViews.read(self.folders[index])
+        kinds = self._files(index, folder, stored.numbers, truth=True).values()
+        files = dict(zip(self.view_names(index), zip(*kinds, strict=True), strict=True))
+        return Listing(self._geometry(index, stored).normalised(self.distance).c2w, files)
+
     def load(self, index: int, views: Sequence[int] | None = None, truth: bool = False) -> Scene:
         folder, stored = self.folders[index], MaterialViews.read(self.folders[index])
         geometry = self._geometry(index, stored)
         report(self.root, geometry)
-        environment = self.environments[index]
-        if environment is None:
-            environment = _environments_of(folder)[0]
-        renders = numbered_files(folder / "render" / environment, IMAGE_SUFFIXES, stored.numbers)
-        segments = numbered_files(folder / "segmentation", IMAGE_SUFFIXES, stored.numbers)
+        found = self._files(index, folder, stored.numbers, truth)
+        renders, segments = found["render"], found["segmentation"]
         positions = list(range(len(stored.numbers)) if views is None else views)
-        masks = [images.decode_mask(segments[p]) for p in positions]
+        masks = [read_mask(segments[p]) for p in positions]
         on_white = [_on_white(renders[p], mask, segments[p]) for p, mask in zip(positions, masks, strict=True)]
         K = [_checked_K(folder, stored, p, mask.shape) for p, mask in zip(positions, masks, strict=True)]
         depth = None
-        if truth and (folder / "depth").is_dir():
-            files = numbered_files(folder / "depth", (".exr",), stored.numbers)
+        if "depth" in found:
+            files = found["depth"]
             scale = self.distance / geometry.distance
             depth = [
                 self.framing.values(scale * self._z_depth(files[p], k, mask.shape))
@@ -182,6 +186,16 @@ class ABOMaterials:
             mask=_stacked([self.framing.values(mask) for mask in masks]) if truth else None,
             depth=None if depth is None else _stacked(depth),
         )
+
+    def _files(self, index: int, folder: Path, numbers: tuple[int, ...], truth: bool) -> dict[str, list[Path]]:
+        """Renders, segmentations and, for `truth` where there are any, depths of all views."""
+        environment = self.environments[index]
+        if environment is None:
+            environment = _environments_of(folder)[0]
+        wanted = {"render": (f"render/{environment}", IMAGE_SUFFIXES), "segmentation": ("segmentation", IMAGE_SUFFIXES)}
+        if truth and (folder / "depth").is_dir():
+            wanted["depth"] = ("depth", (".exr",))
+        return {kind: numbered_files(folder / part, suffixes, numbers) for kind, (part, suffixes) in wanted.items()}
 
     def _geometry(self, index: int, stored: MaterialViews) -> ObjectCameras:
         names = tuple(map(str, stored.numbers))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras
@@ -21,9 +21,10 @@ from nerfdiff.data.abo_transforms import IMAGES, KEY_FILE, ItemTransforms
 from nerfdiff.data.framing import Framing
 from nerfdiff.data.index import folder_stamp
 from nerfdiff.data.item_folders import item_folders
+from nerfdiff.data.masks import stacked_masks
 from nerfdiff.data.npz_files import read_depth
 from nerfdiff.data.optical_axes import ObjectCameras, check_settings, object_cameras, report
-from nerfdiff.data.scene import MissingSplit, Scene
+from nerfdiff.data.scene import Listing, MissingSplit, Scene
 from nerfdiff.data.split_file import stored_split
 from nerfdiff.data.view_stack import stack_pixels
 from nerfdiff.errors import ConfigError, DataError
@@ -109,6 +110,15 @@ class ABORenders:
         """All cameras of a scene as the file has them: what convention was found, and what they look at."""
         return self._geometry(index, ItemTransforms.read(self.folders[index]))
 
+    def listing(self, index: int) -> Listing:
+        folder, transforms = self.folders[index], ItemTransforms.read(self.folders[index])
+        depth = (folder / "depth").is_dir()
+        files = {
+            name: [folder / f"{name}.png", *([folder / "depth" / f"{name}.npz"] if depth else [])]
+            for name in transforms.views
+        }
+        return Listing(self._geometry(index, transforms).normalised(self.distance).c2w, files)
+
     def load(self, index: int, views: Sequence[int] | None = None, truth: bool = False) -> Scene:
         transforms = ItemTransforms.read(self.folders[index])
         geometry = self._geometry(index, transforms)
@@ -131,21 +141,13 @@ class ABORenders:
             cameras=Cameras(torch.from_numpy(c2w).float(), torch.from_numpy(np.stack(K)).float(), *pixels.shape[-2:]),
             near=self.near,
             far=self.far,
-            mask=self._masks([opaque for _, opaque in decoded]) if truth else None,
+            mask=stacked_masks([opaque for _, opaque in decoded], self.framing, by_alpha=True) if truth else None,
             depth=self._depth(files, [image.shape[:2] for image in stored], geometry) if truth else None,
         )
 
     def _geometry(self, index: int, transforms: ItemTransforms) -> ObjectCameras:
         file = self.folders[index] / KEY_FILE
         return object_cameras(transforms.poses, self.convention, file, transforms.views)
-
-    def _masks(
-        self, masks: Sequence[Bool[np.ndarray, "height width"] | None]
-    ) -> Bool[Tensor, "views new_height new_width"] | None:
-        """Framed: where the images are opaque; None where one of them has no alpha."""
-        if any(mask is None for mask in masks):
-            return None
-        return torch.from_numpy(np.stack([self.framing.values(mask) for mask in masks]))
 
     def _depth(
         self, files: Sequence[Path], sizes: Sequence[tuple[int, int]], geometry: ObjectCameras

@@ -3,12 +3,15 @@
     <folder>/<name>-<which reader>-<which files>/{images.u8, cameras.npz, scenes.json}
 
 The name says what is in it, so a cache that is there is valid. It is built in a folder of another name,
-under a lock, and renamed when it is whole. Images are read by position rather than through a memory map: that
-is 1.3 times as fast on pages mapped before and 4 times on others, and a shortened file is an error and no crash.
+under a lock, and renamed when it is whole. The index (scenes.json) keeps SHA-256 of itself and of the cameras, and
+these come with that of each image, which each process checks when it first reads the image. Images are read by
+position rather than through a memory map: that is 1.3 times as fast on pages mapped before and 4 times on others,
+and a shortened file is an error and no crash.
 """
 
 import errno
 import hashlib
+import io
 import json
 import logging
 import os
@@ -27,10 +30,11 @@ from rich.progress import track
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras
-from nerfdiff.data.scene import Scene, SceneReader
-from nerfdiff.errors import DataError
+from nerfdiff.data.scene import Listing, Scene, SceneReader
+from nerfdiff.errors import DataError, size_text
+from nerfdiff.results.hashes import sha256_file, sha256_values
 
-FORMAT = "3"  # to be raised when the files above change their meaning, or readers decode other pixels
+FORMAT = "4"  # to be raised when the files above change their meaning, or readers decode other pixels
 MAX_THREADS = 16  # decoding releases the interpreter lock, but not all the time
 log = logging.getLogger(__name__)
 
@@ -59,16 +63,25 @@ class CachedReader:
         self.path = Path(folder) / f"{prefix}-{_short(self._fingerprint)}"
         if not self.path.exists():
             _build(reader, self.path, prefix)
-        index = json.loads((self.path / "scenes.json").read_text())
+        try:
+            index = json.loads((self.path / "scenes.json").read_text())
+            arrays = (self.path / "cameras.npz").read_bytes()
+            size = (self.path / "images.u8").stat().st_size
+        except (OSError, ValueError) as error:
+            raise self._damaged() from error
+        if not isinstance(index, dict) or index.pop("sha256", None) != sha256_values(index):
+            raise self._damaged()
         self._ids: list[str] = index["ids"]
         self._views = [tuple(views) for views in index["views"]]
         self._starts = _starts(self._views)
         self._shape = (self._starts[-1], 3, index["height"], index["width"])
-        if (self.path / "images.u8").stat().st_size != np.prod(self._shape):
+        if size != np.prod(self._shape) or hashlib.sha256(arrays).hexdigest() != index["cameras"]:
             raise self._damaged()
-        with np.load(self.path / "cameras.npz") as arrays:
+        with np.load(io.BytesIO(arrays)) as arrays:
             self._c2w, self._K = (torch.from_numpy(arrays[key]) for key in ("c2w", "K"))
             self._bounds: list[list[float]] = arrays["bounds"].tolist()
+            self._digests = arrays["digests"]
+        self._checked = np.zeros(len(self._digests), bool)
         self._file: int | None = None
 
     def __len__(self) -> int:
@@ -82,6 +95,9 @@ class CachedReader:
 
     def view_names(self, index: int) -> tuple[str, ...]:
         return self._views[index]
+
+    def listing(self, index: int) -> Listing:
+        return self.reader.listing(index)
 
     def load(self, index: int, views: Sequence[int] | None = None, truth: bool = False) -> Scene:
         if truth:
@@ -106,6 +122,10 @@ class CachedReader:
         for image, row in zip(pixels.numpy(), rows, strict=True):
             if os.preadv(self._file, [image], row * image.nbytes) != image.nbytes:
                 raise self._damaged()
+            if not self._checked[row]:
+                if hashlib.sha256(image).digest() != self._digests[row].tobytes():
+                    raise self._damaged()
+                self._checked[row] = True
         return pixels
 
     def _damaged(self) -> DataError:
@@ -157,6 +177,7 @@ def _write(reader: SceneReader, folder: Path) -> None:
     folder.mkdir()
     c2w, K = np.empty((starts[-1], 4, 4), np.float32), np.empty((starts[-1], 3, 3), np.float32)
     bounds = np.empty((len(views), 2))  # near and far of each scene
+    digests = np.empty((starts[-1], hashlib.sha256().digest_size), np.uint8)
 
     def copy(index: int) -> None:
         scene = reader.load(index)
@@ -168,6 +189,8 @@ def _write(reader: SceneReader, folder: Path) -> None:
         rows = slice(starts[index], starts[index + 1])
         c2w[rows], K[rows] = scene.cameras.c2w.numpy(), scene.cameras.K.numpy()
         bounds[index] = scene.near, scene.far
+        for row, image in zip(digests[rows], scene.pixels.numpy(), strict=True):
+            row[:] = np.frombuffer(hashlib.sha256(image).digest(), np.uint8)
         # written, not mapped: a full disk is then an error and no crash of the process
         with open(folder / "images.u8", "r+b") as file:
             file.seek(starts[index] * image_bytes)
@@ -182,9 +205,11 @@ def _write(reader: SceneReader, folder: Path) -> None:
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    np.savez(folder / "cameras.npz", c2w=c2w, K=K, bounds=bounds)
+    np.savez(folder / "cameras.npz", c2w=c2w, K=K, bounds=bounds, digests=digests)
     ids = [reader.scene_id(index) for index in range(len(reader))]
     index = {"ids": ids, "views": views, "height": height, "width": width}
+    index |= {"cameras": sha256_file(folder / "cameras.npz")}
+    index |= {"sha256": sha256_values(index)}
     (folder / "scenes.json").write_text(json.dumps(index))
     for file in folder.iterdir():
         with open(file, "rb") as handle:
@@ -194,7 +219,7 @@ def _write(reader: SceneReader, folder: Path) -> None:
 def _require_space(folder: Path, needed: int) -> None:
     free = shutil.disk_usage(folder).free
     if free < needed:
-        raise OSError(errno.ENOSPC, f"it takes {needed / 1e9:.2f} GB, and {free / 1e9:.2f} GB are free")
+        raise OSError(errno.ENOSPC, f"it takes {size_text(needed)}, and {size_text(free)} are free")
 
 
 def _starts(views: Sequence[Sequence[str]]) -> list[int]:

@@ -21,7 +21,7 @@ from nerfdiff.data.clevr3d_metadata import camera_positions, object_counts
 from nerfdiff.data.framing import Framing
 from nerfdiff.data.index import folder_stamp
 from nerfdiff.data.pinhole import ASPECT_TOLERANCE
-from nerfdiff.data.scene import MissingSplit, Scene
+from nerfdiff.data.scene import Listing, MissingSplit, Scene
 from nerfdiff.data.view_stack import stack_pixels
 from nerfdiff.errors import ConfigError, DataError, some
 
@@ -122,10 +122,18 @@ class Clevr3DReader:
     def view_names(self, index: int) -> tuple[str, ...]:
         return tuple(map(str, range(self.positions.shape[1])))
 
+    def listing(self, index: int) -> Listing:
+        scene, names = self.scene_id(index), self.view_names(index)
+        truth = [kind for kind in ("masks", "depths") if (self.folder / kind).is_dir()]
+        files = {
+            name: [self._image(scene, name), *(self._truth_file(kind, scene, name) for kind in truth)] for name in names
+        }
+        return Listing(np.stack([_looking_at_origin(position) for position in self.positions[index]]), files)
+
     def load(self, index: int, views: Sequence[int] | None = None, truth: bool = False) -> Scene:
         scene, names = self.scene_id(index), self.view_names(index)
         numbers = [range(len(names))[view] for view in (range(len(names)) if views is None else views)]
-        files = [self.folder / f"images/img_{scene}_{view}.png" for view in numbers]
+        files = [self._image(scene, view) for view in numbers]
         stored = [images.decode(file) for file in files]
         sizes = [image.shape[:2] for image in stored]
         K = [self._K(file, *size) for file, size in zip(files, sizes, strict=True)]
@@ -142,6 +150,12 @@ class Clevr3DReader:
             mask=self._truth("masks", scene, numbers, K, sizes) if truth else None,
             depth=self._truth("depths", scene, numbers, K, sizes) if truth else None,
         )
+
+    def _image(self, scene: str, view: int | str) -> Path:
+        return self.folder / f"images/img_{scene}_{view}.png"
+
+    def _truth_file(self, kind: str, scene: str, view: int | str) -> Path:
+        return self.folder / kind / f"{kind}_{scene}_{view}.png"
 
     def _K(self, file: Path, height: int, width: int) -> Float[np.ndarray, "3 3"]:
         """Intrinsics of a stored image, whose principal point is its centre."""
@@ -162,12 +176,11 @@ class Clevr3DReader:
         sizes: Sequence[tuple[int, int]],
     ) -> torch.Tensor | None:
         """Masks or depths of these views; None where the dataset is without them."""
-        folder = self.folder / kind
-        if not folder.is_dir():
+        if not (self.folder / kind).is_dir():
             return None
         values = []
         for view, k, size in zip(views, K, sizes, strict=True):
-            file = folder / f"{kind}_{scene}_{view}.png"
+            file = self._truth_file(kind, scene, view)
             levels = images.decode_levels(file)
             if levels.shape != size:
                 raise DataError(
@@ -179,7 +192,7 @@ class Clevr3DReader:
     def _refuse_more_images_than_cameras(self) -> None:
         """Looked up for one scene: the number of views is the same for all."""
         views = self.positions.shape[1]
-        extra = self.folder / f"images/img_{self.scenes[0]}_{views}.png"
+        extra = self._image(self.scene_id(0), views)
         if extra.exists():
             raise DataError(f"{extra}: an image without a camera: {self.metadata} has {views} cameras per scene")
 

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from nerfdiff.data.draws import Draws, DrawSampler
 from nerfdiff.data.scene import MissingSplit, SceneReader
 from nerfdiff.data.views import EvaluationScenes, TrainingViews, spread
 from nerfdiff.errors import ConfigError
+from nerfdiff.stopping import ignore_signals
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +52,7 @@ class SceneDataModule(LightningDataModule):
         num_workers: processes that load training and test batches.
         cache, cache_dir: whether training images are decoded once into one file, and where.
         seed: of the draws.
+        about: words on the data for whoever uses a model trained on it, as the elevations its cameras have.
         train_split, val_split, test_split: names of the dataset's splits. Where the one for validation is
             not there, training goes on without validation.
 
@@ -81,6 +84,7 @@ class SceneDataModule(LightningDataModule):
         cache: bool,
         cache_dir: str | Path,
         seed: int,
+        about: str,
         train_split: str = "train",
         val_split: str = "val",
         test_split: str = "test",
@@ -93,6 +97,7 @@ class SceneDataModule(LightningDataModule):
             "val_scenes": val_scenes,
             "val_targets": val_targets,
             "train_scenes": 1 if train_scenes is None else train_scenes,
+            "train_source_views": 1 if train_source_views is None else train_source_views,
             "eval_scenes": 1 if eval_scenes is None else eval_scenes,
             "eval_stride": eval_stride,
         }
@@ -117,10 +122,20 @@ class SceneDataModule(LightningDataModule):
         self.val_source_view, self.val_scenes, self.val_targets = val_source_view, val_scenes, val_targets
         self.source_view, self.eval_scenes, self.eval_stride = source_view, eval_scenes, eval_stride
         self.cache, self.cache_dir = cache, cache_dir
+        self.about = about
         self.splits = {"train": train_split, "val": val_split, "test": test_split}
         self.train_reader: SceneReader | None = None
         self.val_set: EvaluationScenes | None = None
         self.test_set: EvaluationScenes | None = None
+
+    @cached_property
+    def _trained_on(self) -> dict[str, str]:
+        reader = self.reader("train")
+        return {"root": str(Path(self.root).resolve()), "reader": reader.identity, "files": reader.fingerprint()}
+
+    def state_dict(self) -> dict[str, str]:
+        """What a run is trained on, for its checkpoints: the reader's identity, and its files' fingerprint."""
+        return self._trained_on
 
     def reader(self, stage: str) -> SceneReader:
         """The reader of the files of the split that "train", "val" or "test" stands for.
@@ -130,8 +145,14 @@ class SceneDataModule(LightningDataModule):
         """
         return self.make_reader(root=self.root, split=self.splits[stage], image_size=self.image_size)
 
+    @property
+    def trained_scenes(self) -> int:
+        """How many scenes a run draws from."""
+        return len(spread(len(self.train_reader), self.train_scenes))
+
     def setup(self, stage: str) -> None:
         if stage == "fit":
+            _ = self._trained_on  # of the files as they are now, not at the first checkpoint
             self.train_reader = self.reader("train")
             if self.cache:
                 name = f"{self.name}_{self.splits['train']}"
@@ -225,7 +246,11 @@ class SceneDataModule(LightningDataModule):
 
 
 def _common_options() -> dict[str, Any]:
-    return {"collate_fn": ViewBatch.collate, "pin_memory": torch.cuda.is_available()}
+    return {
+        "collate_fn": ViewBatch.collate,
+        "pin_memory": torch.cuda.is_available(),
+        "worker_init_fn": ignore_signals,  # a step that is to be finished needs its data
+    }
 
 
 class TrainingLoader(DataLoader):

@@ -12,8 +12,11 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from PIL.ExifTags import Base
 
 from nerfdiff.data.pinhole import ASPECT_TOLERANCE
+from nerfdiff.data.posed_files import require_file
 from nerfdiff.errors import DataError
 
+MAX_PIXELS = 64_000_000
+"""Of an image, which takes some 25 bytes of memory each until it is resized."""
 READ_FORMATS = {b"\x89PNG": "PNG", b"\xff\xd8\xff": "JPEG", b"RIFF": "WebP"}
 """First bytes of what most images are: one of these that Pillow does not know is damaged."""
 log = logging.getLogger(__name__)
@@ -45,7 +48,7 @@ def decode_with_alpha(
     Raises:
         DataError: as `decode`.
     """
-    image = _open(path)
+    image = open_image(path)
     image = ImageOps.exif_transpose(image) if upright else _as_its_camera_has_it(image, path, size)
     if image.mode == "F":
         raise DataError(f"{path}: its pixels are floating-point numbers; save it with 8 or 16 bits per channel")
@@ -64,16 +67,6 @@ def decode_with_alpha(
     return ((colour * alpha + 255 * (255 - alpha) + 127) // 255).astype(np.uint8), rgba[..., 3] > 127
 
 
-def decode_mask(path: Path) -> Bool[np.ndarray, "height width"]:
-    """Decode an 8-bit mask: foreground is above half of white or, where there are only 0 and 1, 1.
-
-    Raises:
-        DataError: as `decode`.
-    """
-    grey = np.asarray(_open(path).convert("L"))
-    return grey > (0 if grey.max() == 1 else 127)
-
-
 def stored_size(path: Path) -> tuple[int, int]:
     """(height, width) by the file's header, without decoding.
 
@@ -90,7 +83,7 @@ def decode_levels(path: Path) -> Integer[np.ndarray, "height width"]:
     Raises:
         DataError: as `decode`, or the image has several channels or no whole numbers.
     """
-    image = _open(path)
+    image = open_image(path)
     levels = np.asarray(image)
     if levels.dtype == bool:
         levels = levels.astype(np.uint8)
@@ -167,8 +160,18 @@ def _warn_of_orientation(folder: Path, orientation: int) -> None:
     )
 
 
-def _open(path: Path) -> Image.Image:
+def open_image(path: Path) -> Image.Image:
+    """The decoded image as Pillow has it.
+
+    Raises:
+        DataError: as `decode`.
+    """
     with _readable(path), Image.open(path) as image:
+        if image.height * image.width > MAX_PIXELS:
+            raise DataError(
+                f"{path}: {image.height}x{image.width} are {image.height * image.width / 1e6:.0f} million pixels, "
+                f"expected at most {MAX_PIXELS / 1e6:.0f} million; save it smaller"
+            )
         image.load()
         return image
 
@@ -177,7 +180,10 @@ def _open(path: Path) -> Image.Image:
 def _readable(path: Path) -> Iterator[None]:
     """What Pillow raises on missing and damaged files, as one error that names the file."""
     try:
+        require_file(path)
         yield
+    except DataError:
+        raise
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such image") from error
     except UnidentifiedImageError as error:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from nerfdiff.data.posed_files import require_file
 from nerfdiff.errors import DataError
 
 
@@ -18,11 +19,14 @@ def read_array(path: Path, key: str, expected: str) -> np.ndarray:
         DataError: the file is missing or damaged, or has no such array of numbers.
     """
     try:
+        require_file(path)
         arrays = np.load(path)
         if isinstance(arrays, np.ndarray):
             raise ValueError("it is a single array")
         with arrays:
             array = arrays[key]
+    except DataError:
+        raise
     except Exception as error:  # damaged bytes surface as whatever zipfile, zlib or NumPy trips over
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DataError(f"{path}: expected an npz file with an array '{key}' {expected} ({reason})") from error

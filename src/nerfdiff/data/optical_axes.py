@@ -130,10 +130,13 @@ def report(root: Path, found: ObjectCameras) -> None:
 
 
 def closest_point(
-    c2w: Float[np.ndarray, "views 4 4"],
+    c2w: Float[np.ndarray, "views 4 4"], weights: Float[np.ndarray, " views"] | None = None
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "views 3 3"]]:
     """The point closest to all optical axes (the z axes) in the least-squares sense; of no meaning where these are
     near parallel.
+
+    Args:
+        weights: of each axis's squared distance; None: all alike.
 
     Returns:
         the point p, and I − d dᵀ of each axis d: the distance of p from axis d through C is that of (I − d dᵀ)(p − C)
@@ -141,7 +144,8 @@ def closest_point(
     """
     axes, centres = c2w[:, :3, 2], c2w[:, :3, 3]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    return np.linalg.lstsq(across.sum(0), np.einsum("vij,vj->i", across, centres), rcond=None)[0], across
+    weighted = across if weights is None else across * weights[:, None, None]
+    return np.linalg.lstsq(weighted.sum(0), np.einsum("vij,vj->i", weighted, centres), rcond=None)[0], across
 
 
 def _meet(c2w: Float[np.ndarray, "views 4 4"], inverted: bool) -> ObjectCameras | None:

@@ -1,6 +1,7 @@
 """Poses and intrinsics in text files, checked as they are read."""
 
 import codecs
+import stat
 from pathlib import Path
 
 import numpy as np
@@ -42,10 +43,23 @@ def read_text(path: Path, expected: str) -> str:
         DataError: the file cannot be read; the message says what was `expected` in it.
     """
     try:
+        require_file(path)
         content = path.read_bytes()
         return content.decode("utf-16" if content.startswith(UTF16_MARKS) else "utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: {expected}, but it cannot be read ({error})") from error
+
+
+def require_file(path: Path) -> None:
+    """Refuse what would be waited for or read without end: pipes, sockets, devices.
+
+    Raises:
+        DataError: it is there, and no ordinary file.
+        OSError: it is not there, or cannot be looked at.
+    """
+    mode = path.stat().st_mode
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):  # opening a folder fails by itself
+        raise DataError(f"{path}: no ordinary file, but a pipe, socket or device; give a file")
 
 
 def read_pose(path: Path) -> Float[np.ndarray, "4 4"]:

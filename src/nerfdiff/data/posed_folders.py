@@ -18,7 +18,7 @@ def find_scenes(root: Path, split: str, split_sizes: Mapping[str, int], seed: in
 
     Raises:
         ConfigError: an unknown split.
-        MissingSplit: the scenes lie in folders for other splits, or are too few.
+        MissingSplit: the scenes lie in folders for other splits, or are too few; or the split's folder is empty.
         DataError: `root` is missing or has no scenes.
     """
     if split not in split_sizes:
@@ -35,7 +35,7 @@ def find_scenes(root: Path, split: str, split_sizes: Mapping[str, int], seed: in
             raise MissingSplit(f"{root}: no {split} split; found only {', '.join(laid_out)}")
         scenes = _folders(root / split)
         if not scenes:
-            raise DataError(
+            raise MissingSplit(
                 f"{root / split}: the split is empty; expected one folder per scene, each with its {wanted}"
             )
         return scenes

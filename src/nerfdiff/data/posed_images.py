@@ -25,9 +25,10 @@ from nerfdiff.data import images
 from nerfdiff.data.bounds import Gaze
 from nerfdiff.data.framing import Framing
 from nerfdiff.data.index import folder_stamp
+from nerfdiff.data.masks import likely_misreading, read_mask, stacked_masks
 from nerfdiff.data.posed_files import MAX_POSITION
 from nerfdiff.data.posed_folders import find_scenes
-from nerfdiff.data.scene import Scene
+from nerfdiff.data.scene import Listing, Scene
 from nerfdiff.data.transforms_json import Frame, Transforms, read_transforms
 from nerfdiff.data.view_stack import stack_pixels
 from nerfdiff.errors import ConfigError, DataError
@@ -67,6 +68,9 @@ class PosedImagesReader:
             None keeps the stored size.
         crop: (height, width), or one side of a square, to cut out of the middle before; None keeps all.
         missing_images: "error" or "skip" frames whose image or mask is not there.
+        inverted_masks: white marks the background in a frame's mask, as instant-ngp has it.
+        max_mask_border: share of the border that masks of objects may cover (`masks.likely_misreading`): a scene that
+            is read as a whole is refused where its masks look misread; None refuses none.
 
     Raises:
         ConfigError: settings that make no sense.
@@ -90,6 +94,8 @@ class PosedImagesReader:
         image_size: int | Sequence[int] | None = None,
         crop: int | Sequence[int] | None = None,
         missing_images: str = "error",
+        inverted_masks: bool = False,
+        max_mask_border: float | None = 0.5,
     ):
         if not all(bound is None or bound > 0 for bound in (near, far)) or (near and far and near >= far):
             raise ConfigError(f"near = {near} and far = {far} must satisfy 0 < near < far, or be null")
@@ -101,12 +107,13 @@ class PosedImagesReader:
             )
         self.near, self.far, self.missing_images = near, far, missing_images
         self.convention, self.inward, self.white_background = convention, inward, white_background
+        self.inverted_masks, self.max_mask_border = inverted_masks, max_mask_border
         self.framing = Framing.of(crop, image_size)
         root = Path(root)
         self.folders = find_scenes(root, split, split_sizes, split_seed)
         self.identity = (
             f"posed_images {root.resolve()} {split} {dict(split_sizes)} {split_seed} {self.framing} {convention} "
-            f"bounds {near} {far} white {white_background} missing {missing_images}"
+            f"bounds {near} {far} white {white_background} missing {missing_images} inverted masks {inverted_masks}"
         )
         self._parsed: dict[int, _PosedScene] = {}
         first = self._scene(0)
@@ -137,11 +144,19 @@ class PosedImagesReader:
     def view_names(self, index: int) -> tuple[str, ...]:
         return tuple(frame.name for frame in self._scene(index).transforms.frames)
 
+    def listing(self, index: int) -> Listing:
+        transforms = self._scene(index).transforms
+        files = {f.name: [f.image, *([] if f.mask is None else [f.mask])] for f in transforms.frames}
+        return Listing(transforms.c2w, files)
+
     def load(self, index: int, views: Sequence[int] | None = None, truth: bool = False) -> Scene:
         scene = self._scene(index)
         every = scene.transforms.frames
         frames = every if views is None else [every[view] for view in views]
         opened = [self._open(frame, truth) for frame in frames]
+        masks, by_alpha = [mask for _, mask, _ in opened], all(frame.mask is None for frame in frames)
+        if views is None and self.white_background and not by_alpha:
+            self._refuse_misread(index, [mask for mask, frame in zip(masks, frames, strict=True) if frame.mask])
         pixels = stack_pixels([self.framing.image(image) for image, _, _ in opened], [frame.image for frame in frames])
         K = [self.framing.K(k, *image.shape[:2]) for image, _, k in opened]
         c2w = np.stack([frame.c2w for frame in frames])
@@ -152,7 +167,7 @@ class PosedImagesReader:
             cameras=Cameras(torch.from_numpy(c2w).float(), torch.from_numpy(np.stack(K)).float(), *pixels.shape[-2:]),
             near=scene.near,
             far=scene.far,
-            mask=self._truth([mask for _, mask, _ in opened]) if truth else None,
+            mask=stacked_masks(masks, self.framing, by_alpha) if truth else None,
         )
 
     def _open(
@@ -161,7 +176,7 @@ class PosedImagesReader:
         """A frame's image, its foreground by mask or else, where `truth` asks for it, by transparency, and its K."""
         image, opaque = images.decode_with_alpha(frame.image, frame.pinhole.size)
         opaque = opaque if truth else None
-        K, mask = frame.pinhole.K(*image.shape[:2]), _mask(frame, image.shape[:2])
+        K, mask = frame.pinhole.K(*image.shape[:2]), self._mask(frame, image.shape[:2])
         foreground = opaque if mask is None else mask
         if frame.lens is not None:
             image = frame.lens.image(image, K)
@@ -188,6 +203,14 @@ class PosedImagesReader:
         far = self.far if self.far is not None else transforms.far
         if near is None or far is None:
             estimated = gaze.bounds(_half_angle(transforms.frames), folder)
+            strays = gaze.describe_strays([frame.name for frame in transforms.frames])
+            if strays is not None:
+                log.warning(
+                    "%s: %s; near and far are estimated without them. Mend their poses, or set data.reader.near and "
+                    "data.reader.far if they are right",
+                    folder,
+                    strays,
+                )
             near, far = estimated[0] if near is None else near, estimated[1] if far is None else far
         if not 0 < near < far < MAX_POSITION:
             raise DataError(
@@ -196,13 +219,26 @@ class PosedImagesReader:
             )
         return _PosedScene(transforms, float(near), float(far))
 
-    def _truth(
-        self, foreground: Sequence[Bool[np.ndarray, "height width"] | None]
-    ) -> Bool[torch.Tensor, "views new_height new_width"] | None:
-        """The views' framed foreground; None where one of them has neither mask nor transparency."""
-        if any(mask is None for mask in foreground):
+    def _mask(self, frame: Frame, size: tuple[int, int]) -> Bool[np.ndarray, "height width"] | None:
+        if frame.mask is None:
             return None
-        return torch.from_numpy(np.stack([self.framing.values(mask) for mask in foreground]))
+        mask = read_mask(frame.mask)
+        if mask.shape != size:
+            raise DataError(
+                f"{frame.mask}: {mask.shape[0]}x{mask.shape[1]} pixels, its image {frame.image.name} has "
+                f"{size[0]}x{size[1]}"
+            )
+        return ~mask if self.inverted_masks else mask
+
+    def _refuse_misread(self, index: int, masks: Sequence[Bool[np.ndarray, "_ _"]]) -> None:
+        """Before a misread mask leaves white images, or paints the object white."""
+        reason = None if self.max_mask_border is None else likely_misreading(masks, self.max_mask_border)
+        if reason is not None:
+            raise DataError(
+                f"{self.folders[index]}: {reason}. Where masks are white for the background, set "
+                f"data.reader.inverted_masks={str(not self.inverted_masks).lower()}; where they are right, "
+                "data.reader.max_mask_border=null; to leave images as they are, data.reader.white_background=false"
+            )
 
 
 def _half_angle(frames: Sequence[Frame]) -> float:
@@ -217,18 +253,6 @@ def _half_angle(frames: Sequence[Frame]) -> float:
         K = frame.pinhole.K(height, width)
         widest = max(widest, math.atan(max(width / K[0, 0], height / K[1, 1]) / 2))
     return widest
-
-
-def _mask(frame: Frame, size: tuple[int, int]) -> Bool[np.ndarray, "height width"] | None:
-    if frame.mask is None:
-        return None
-    mask = images.decode_mask(frame.mask)
-    if mask.shape != size:
-        raise DataError(
-            f"{frame.mask}: {mask.shape[0]}x{mask.shape[1]} pixels, its image {frame.image.name} has "
-            f"{size[0]}x{size[1]}"
-        )
-    return mask
 
 
 def _visible(folder: Path) -> list[Path]:

@@ -1,9 +1,11 @@
 """What every dataset reader yields, whatever lay on disk."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
@@ -45,6 +47,20 @@ class Scene:
         return self.pixels.float() / 255
 
 
+@dataclass(frozen=True)
+class Listing:
+    """All views of a scene, as far as no image need be decoded.
+
+    Args:
+        c2w: camera-to-world with OpenCV axes, in the dataset's world.
+        files: by view name, the files that reading the view and its ground truth takes; whether they exist is not
+            looked up.
+    """
+
+    c2w: Float[np.ndarray, "views 4 4"]
+    files: Mapping[str, Sequence[Path]]
+
+
 @runtime_checkable
 class SceneReader(Protocol):
     """One split of one dataset: an ordered collection of scenes read lazily from disk."""
@@ -68,6 +84,13 @@ class SceneReader(Protocol):
 
     def view_names(self, index: int) -> tuple[str, ...]:
         """Sorted names of the views of scene `index`, without decoding images."""
+
+    def listing(self, index: int) -> Listing:
+        """Poses and files of all views of scene `index`.
+
+        Raises:
+            DataError: as `load`, but for what only decoding shows.
+        """
 
     def load(self, index: int, views: Sequence[int] | None = None, truth: bool = False) -> Scene:
         """Read the views at these positions of `view_names` (all where None).

@@ -19,9 +19,10 @@ from nerfdiff.cameras import Cameras
 from nerfdiff.data import images
 from nerfdiff.data.fingerprint import fingerprint_folders
 from nerfdiff.data.framing import Framing
+from nerfdiff.data.masks import read_mask
 from nerfdiff.data.npz_files import read_depth
 from nerfdiff.data.posed_files import inverse_pose, read_pose
-from nerfdiff.data.scene import MissingSplit, Scene
+from nerfdiff.data.scene import Listing, MissingSplit, Scene
 from nerfdiff.data.srn_intrinsics import SceneIntrinsics, read_view_intrinsics
 from nerfdiff.data.view_stack import stack_pixels
 from nerfdiff.errors import ConfigError, DataError, some
@@ -54,8 +55,8 @@ class SRNReader:
 
     Raises:
         ConfigError: an unknown category or split, or bounds that are not 0 < near < far.
-        MissingSplit: `root` has no such split; the message lists what was looked for.
-        DataError: `root` is missing or empty, or the split has no scenes.
+        MissingSplit: `root` has no such split, or no scenes in it; the message lists what was looked for.
+        DataError: `root` is missing or empty.
     """
 
     nearest_view = False
@@ -83,7 +84,7 @@ class SRNReader:
             sorted(e.name for e in os.scandir(self.folder) if e.is_dir() and not e.name.startswith("."))
         )
         if not self.scenes:
-            raise DataError(f"{self.folder}: the {split} split is empty; expected one folder per scene in it")
+            raise MissingSplit(f"{self.folder}: the {split} split is empty; expected one folder per scene in it")
         self.identity = f"srn {self.folder.resolve()} {self.framing} bounds {self.near} {self.far}"
         self._listed: dict[int, _Folder] = {}
 
@@ -101,6 +102,16 @@ class SRNReader:
     def view_names(self, index: int) -> tuple[str, ...]:
         return self._list(index).views
 
+    def listing(self, index: int) -> Listing:
+        folder = self._list(index)
+        kinds = [("pose", "txt"), ("intrinsics", "txt"), ("mask", "png"), ("depth", "npz")]
+        there = [(kind, suffix) for kind, suffix in kinds if (folder.path / kind).is_dir()]
+        files = {
+            name: [image, *(folder.path / kind / f"{name}.{suffix}" for kind, suffix in there)]
+            for name, image in zip(folder.views, folder.rgb, strict=True)
+        }
+        return Listing(np.stack(_poses(folder, folder.views, _shared_intrinsics(folder.path))), files)
+
     def load(self, index: int, views: Sequence[int] | None = None, truth: bool = False) -> Scene:
         folder = self._list(index)
         positions = range(len(folder.views)) if views is None else views
@@ -111,9 +122,7 @@ class SRNReader:
         sizes = [image.shape[:2] for image in stored]
         K = self._intrinsics(folder, names, sizes, shared)
         pixels = stack_pixels([self.framing.image(image) for image in stored], [folder.rgb[p] for p in positions])
-        poses = [read_pose(folder.path / "pose" / f"{name}.txt") for name in names]
-        if shared is not None and shared.world2cam:
-            poses = [inverse_pose(pose) for pose in poses]
+        poses = _poses(folder, names, shared)
         return Scene(
             id=self.scenes[index],
             views=names,
@@ -158,7 +167,7 @@ class SRNReader:
         """`mask/<view>.png` or `depth/<view>.npz` of generated scenes; None where the folder is not there."""
         if not (folder.path / kind).is_dir():
             return None
-        read, suffix = (images.decode_mask, "png") if kind == "mask" else (read_depth, "npz")
+        read, suffix = (read_mask, "png") if kind == "mask" else (read_depth, "npz")
         values = []
         for name, size in zip(names, sizes, strict=True):
             file = folder.path / kind / f"{name}.{suffix}"
@@ -167,6 +176,11 @@ class SRNReader:
                 raise DataError(f"{file}: shape {value.shape[0]}x{value.shape[1]}, its image has {size[0]}x{size[1]}")
             values.append(self.framing.values(value))
         return torch.from_numpy(np.stack(values))
+
+
+def _poses(folder: _Folder, names: Sequence[str], shared: SceneIntrinsics | None) -> list[Float[np.ndarray, "4 4"]]:
+    poses = [read_pose(folder.path / "pose" / f"{name}.txt") for name in names]
+    return [inverse_pose(pose) for pose in poses] if shared is not None and shared.world2cam else poses
 
 
 def _shared_intrinsics(scene: Path) -> SceneIntrinsics | None:

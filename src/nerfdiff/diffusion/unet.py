@@ -137,7 +137,9 @@ class UNet(nn.Module):
             if level < self.levels - 1:
                 self.up.append(Upsample(channels))
             for _ in range(res_blocks + 1):
-                self.up.append(stage(channels + skips.pop(), mult * width, level, patch * 2**level in attention_downsampling))
+                self.up.append(
+                    stage(channels + skips.pop(), mult * width, level, patch * 2**level in attention_downsampling)
+                )
                 channels = mult * width
         self.norm_out = norm(channels)
         conv_out = nn.Conv2d(channels, out_channels * patch**2, 3, padding=1)

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from lightning import Callback, Trainer
@@ -62,17 +62,12 @@ class Distillation:
         self, model: NerfDiff, scenes: Sequence[ViewBatch], seed: int, callbacks: Sequence[Callback] = ()
     ) -> list[Views]:
         module = self.distil(model, scenes, seed, callbacks)
-        return [
-            Views.of_field(
-                SavedField(module.field.alone(number), model.renderer),
-                scene.target_cameras,
-                module.views[number].denoiser_calls,
-                module.views[number].field_queries,
-                module.trace(number),
-                module.statuses[number],
-            )
-            for number, scene in enumerate(scenes)
-        ]
+        predicted = []
+        for number, (scene, virtual) in enumerate(zip(scenes, module.views, strict=True)):
+            saved = SavedField(module.field.alone(number), model.renderer)
+            made = virtual.denoiser_calls, virtual.field_queries, module.trace(number), module.statuses[number]
+            predicted.append(replace(Views.of_field(saved, scene.target_cameras, *made), virtual_views=len(virtual)))
+        return predicted
 
     def distil(
         self, model: NerfDiff, scenes: Sequence[ViewBatch], seed: int, callbacks: Sequence[Callback] = ()

@@ -1,6 +1,8 @@
 """A refined field on disk: safetensors, with the camera it lives in and all else that rendering it takes."""
 
+import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -51,6 +53,7 @@ def save_field(path: str | Path, saved: SavedField) -> None:
         "render": {name: value for name, value in asdict(saved.renderer).items() if name not in MACHINES},
     }
     state = {name: value.detach().cpu().contiguous() for name, value in field.state_dict().items()}
+    header["sha256"] = _digest(state)
     with atomic(Path(path)) as temporary:
         save_file(state, temporary, {"nerfdiff": json.dumps(header)})
 
@@ -67,13 +70,24 @@ def load_field(path: str | Path) -> SavedField:
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, it is no mapping
         if header["format"] != FORMAT:
             raise DataError(f"{path}: format {header['format']!r}, expected {FORMAT}; distil the scene again")
+        if header.get("sha256", digest := _digest(state)) != digest:  # fields from before have none
+            raise DataError(f"{path}: its bytes changed since it was written; copy it anew, or distil the scene again")
         camera = header["camera"]
         cameras = Cameras(torch.eye(4)[None], torch.tensor([camera["K"]]), camera["height"], camera["width"])
         bounds = (torch.tensor([header[name]]) for name in ("near", "far"))
         field = RefinedField(Triplane(state["planes"], cameras, *bounds), Decoder(**header["decoder"]))
         field.load_state_dict(state)
         return SavedField(field, Renderer(**header["render"]))
+    except DataError:
+        raise
     except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise DataError(
             f"{path}: not a field saved by this project ({type(error).__name__}: {error}); distil the scene again"
         ) from error
+
+
+def _digest(state: Mapping[str, torch.Tensor]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(state):
+        digest.update(state[name].numpy())
+    return digest.hexdigest()

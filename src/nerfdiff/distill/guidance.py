@@ -60,6 +60,6 @@ class Guidance:
         last: Float[Tensor, "views 3 height width"],
         t: Float[Tensor, ""],
     ) -> Float[Tensor, "views 3 height width"]:
-        """The guided images x̃0; all in [-1, 1]."""
+        """The guided images x̃0; all in [-1, 1], which a difference to the last step's image could leave."""
         compared = x0 if self.compare == "current" else last
-        return x0 - self.weight(t) * (compared - rendered)
+        return (x0 - self.weight(t) * (compared - rendered)).clamp(-1, 1)

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from nerfdiff.distill.ray_batches import RayBatches
 from nerfdiff.distill.refined_field import RefinedField
+from nerfdiff.errors import OutOfMemory, size_text
+from nerfdiff.memory import free_memory
 from nerfdiff.render.renderer import Renderer
 
 log = logging.getLogger(__name__)
@@ -80,6 +82,7 @@ class InnerSteps:
         scenes, per_scene = self.batches.shape
         device = self.field.planes.device
         if steps != self._steps:
+            self._require_memory(steps * scenes * self.rays * (8 + 4 * self.renderer.samples_per_ray), device)
             self._steps, self._graph = steps, None
             self._picked = torch.empty(scenes, steps, self.rays, dtype=torch.long, device=device)
             self._jitter = torch.empty(scenes, steps, self.rays, self.renderer.samples_per_ray, device=device)
@@ -89,6 +92,15 @@ class InnerSteps:
             self._picked[scene].random_(per_scene, generator=source)
             self._jitter[scene].uniform_(generator=source)
         self._number.zero_()
+
+    def _require_memory(self, needed: int, device: torch.device) -> None:
+        """Before the system kills a process that it promised more than there is."""
+        free = free_memory(device)
+        if needed > free:
+            raise OutOfMemory(
+                f"{self.rays} rays a step take {size_text(needed)} for the numbers that are drawn alone, and "
+                f"{device.type} has {size_text(free)} free: lower budget.rays, budget.inner_steps or scenes_at_once"
+            )
 
     def _step(self) -> None:
         """The step whose number is on the device."""

@@ -29,6 +29,7 @@ class Views:
         depth: distance along z in scene units, where the method has a field.
         denoiser_calls: images passed through the CDM.
         field_queries: points at which a field was evaluated.
+        virtual_views: K, how many views a field was fitted to, where it was.
         field: what the images are renderings of, where the method has a field.
         trace: of its fitting, where it was fitted.
         status: `ok`, or why the field is not the one that the method ended with.
@@ -39,6 +40,7 @@ class Views:
     depth: Float[Tensor, "views height width"] | None = None
     denoiser_calls: int = 0
     field_queries: int = 0
+    virtual_views: int | None = None
     field: SavedField | None = None
     trace: Sequence[Step] = ()
     status: str = "ok"

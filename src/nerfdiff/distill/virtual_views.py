@@ -10,6 +10,7 @@ from torch import Tensor
 from nerfdiff.cameras import Cameras
 from nerfdiff.diffusion.deep_features import DeepFeatures, DeepReuse
 from nerfdiff.diffusion.denoiser import Condition
+from nerfdiff.errors import ConfigError
 from nerfdiff.field.encoder import Encoding
 from nerfdiff.model import NerfDiff
 from nerfdiff.randomness import generator
@@ -27,12 +28,17 @@ class VirtualViews:
         cameras: [1, K], in the input camera's space.
         views_at_once: views denoised in one batch, which bounds memory.
         seed: of all noise; a view's noise depends on it and on the view's number alone.
+
+    Raises:
+        ConfigError: no views.
     """
 
     @torch.no_grad()
     def __init__(
         self, model: NerfDiff, encoding: Encoding, cameras: Cameras, views_at_once: int, seed: tuple[int | str, ...]
     ):
+        if cameras.shape[1] < 1:
+            raise ConfigError("there are no virtual views: set budget.views (or prior.views) to at least 1")
         self.model, self.cameras, self.seed = model, cameras, seed
         self.encoding = encoding = model.settled(encoding)
         self._parts = [slice(i, i + views_at_once) for i in range(0, cameras.shape[1], views_at_once)]

@@ -1,5 +1,6 @@
 """What predictions cost: the fields of a row, from what was written down of each scene."""
 
+import logging
 from collections import Counter
 from statistics import fmean
 from typing import Any
@@ -14,12 +15,14 @@ from nerfdiff.render import backend
 from nerfdiff.results.row import Timing
 from nerfdiff.results.timing import cost_of_a_piece, summarise
 
+log = logging.getLogger(__name__)
+
 PARTS = ("denoise", "fit", "guide")
 STABILITY = ("nonfinite_grad_steps", "loss_spikes", "grad_norm_p99")
 
 
 def cost_fields(subject: Subject, strategy: Strategy) -> dict[str, Any]:
-    """The cost fields of a row, with what computed: `model_fields`, the backend, and how many scenes fell back.
+    """The cost fields of a row, with what computed: `model_fields`, the backend, K, and how many scenes fell back.
 
     Only counts for a baseline, of which no model ran.
     """
@@ -39,6 +42,11 @@ def cost_fields(subject: Subject, strategy: Strategy) -> dict[str, Any]:
     fields["timing_s"] = cost_of_a_piece(subject.device) * fmean(cost["pieces"] for cost in scenes)
     fields |= model_fields(subject) | {"backend": _backend(subject)}
     fields["peak_mem_bytes"] = max((cost["peak_mem_bytes"] for cost in alike), default=None)
+    # of the views that were fitted, not of those asked for; a run may go on from one that did not write them down
+    virtual = {cost["virtual_views"] for cost in scenes if cost.get("virtual_views") is not None}
+    if len(virtual) > 1:
+        log.warning("scenes had %d to %d virtual views; the row's K is the most", min(virtual), max(virtual))
+    fields["K"] = max(virtual, default=None)
     fallen = Counter(cost["status"] for cost in scenes if cost["status"] != "ok")
     if fallen:
         fields["error"] = "fell back: " + ", ".join(f"{count} scenes {status}" for status, count in fallen.items())

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
+from itertools import zip_longest
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -134,7 +135,7 @@ def _traces(home: Path, row: ResultRow) -> dict[str, list[float | None]]:
     """What was written down of each step of distillation, where it was: the mean over scenes."""
     folder = home / row.folder / "predictions" / row.strategy
     scenes = [_read(folder / scene / TRACE) for scene in read_plan(folder)["scenes"]]
-    steps = list(zip(*filter(None, scenes), strict=True))
+    steps = list(zip_longest(*filter(None, scenes), fillvalue={}))  # a scene that was lost has fewer
     return {f"distill/{field.name}": [_mean(step, field.name) for step in steps] for field in fields(Step) if steps}
 
 
@@ -145,8 +146,9 @@ def _scenes(home: Path, row: ResultRow) -> dict[str, list[float | None]]:
 
 
 def _mean(lines: Sequence[Mapping[str, str]], column: str) -> float | None:
-    """Of the cells that are not empty."""
-    cells = [float(line[column]) for line in lines if line[column]]
+    """Of the cells that hold finite numbers."""
+    cells = [float(line[column]) for line in lines if line.get(column)]
+    cells = [value for value in cells if math.isfinite(value)]
     return fmean(cells) if cells else None
 
 

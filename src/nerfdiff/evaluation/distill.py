@@ -1,6 +1,8 @@
 """One strategy over the scenes of a dataset, or over one picture, on one or several processes."""
 
 import logging
+import re
+from collections.abc import Sequence
 from datetime import timedelta
 
 import torch
@@ -12,14 +14,16 @@ from lightning.fabric.strategies import DDPStrategy
 from omegaconf import DictConfig
 
 from nerfdiff.distill.strategy import Strategy
-from nerfdiff.errors import ConfigError
+from nerfdiff.errors import ConfigError, ProcessLost
 from nerfdiff.evaluation.dashboard import show_in_dashboard
 from nerfdiff.evaluation.evaluate import show
 from nerfdiff.evaluation.measure import measure, record_failure
 from nerfdiff.evaluation.pictures import sheet
-from nerfdiff.evaluation.predict import predict, require_all
+from nerfdiff.evaluation.predict import done, predict, require_all
 from nerfdiff.evaluation.subject import Subject, choose_device, dataset_subject, picture_subject
+from nerfdiff.processes import end_launched, lost_process, watch
 from nerfdiff.results.row import ResultRow
+from nerfdiff.stopping import Stopped
 from nerfdiff.training import plain
 
 log = logging.getLogger(__name__)
@@ -43,12 +47,15 @@ def distill(cfg: DictConfig) -> ResultRow | None:
     try:
         fabric = _launch(cfg)
         subject = picture_subject(cfg, fabric.device) if cfg.image else dataset_subject(cfg, fabric.device)
-        strategy, scorer = _strategy(cfg), instantiate(cfg.metrics)
+        strategy, scorer = _strategy(cfg), None if cfg.image else instantiate(cfg.metrics)
         _predict_together(fabric, subject, strategy)
         if fabric.global_rank > 0:
             return None
         require_all(subject, strategy)
         row = measure(subject, strategy, scorer, subject.data.reader("test")) if subject.data else None
+    except Stopped as stopped:
+        end_launched(stopped.signum)
+        raise Stopped(stopped.signum, done(subject, strategy) if subject and strategy else "") from None
     except Exception as error:
         if cfg.image or _rank() > 0:
             raise
@@ -71,7 +78,14 @@ def _strategy(cfg: DictConfig) -> Strategy:
     settings = plain(cfg.strategy)
     if cfg.image and "prior" in settings:
         settings["prior"] = plain(cfg.picture_views)
+        _warn_of_inert(HydraConfig.get().overrides.task if HydraConfig.initialized() else ())
     return instantiate(settings)
+
+
+def _warn_of_inert(overrides: Sequence[str]) -> None:
+    aside = [word for word in overrides if re.match(r"[+~]*(prior|data)\b", word)]
+    if aside:
+        log.warning("%s cannot act on a picture: it is seen from picture_views, and needs no dataset", ", ".join(aside))
 
 
 def _rank() -> int:
@@ -98,7 +112,9 @@ def _launch(cfg: DictConfig) -> Fabric:
         raise ConfigError(f"device={cfg.device} is one device: say device={device.type} with processes={cfg.processes}")
     devices = [device.index or 0] if device.type == "cuda" and not many else cfg.processes
     # Processes meet when all are done, however long the longest takes.
-    strategy = DDPStrategy(timeout=timedelta(days=30)) if many else "auto"
+    # They send each other words only, and gloo notices when one dies.
+    strategy = DDPStrategy(timeout=timedelta(days=30), process_group_backend="gloo") if many else "auto"
+    watch()
     fabric = Fabric(accelerator=device.type, devices=devices, strategy=strategy)
     fabric.launch()
     if cfg.threads is not None:
@@ -119,7 +135,12 @@ def _predict_together(fabric: Fabric, subject: Subject, strategy: Strategy) -> N
     if fabric.world_size == 1:
         return
     words: list[str | None] = [None] * fabric.world_size
-    torch.distributed.all_gather_object(words, failure and f"{type(failure).__name__}: {failure}")
+    try:
+        torch.distributed.all_gather_object(words, failure and f"{type(failure).__name__}: {failure}")
+    except RuntimeError as error:
+        if not (sentence := lost_process(error)):
+            raise
+        raise ProcessLost(f"{sentence} {done(subject, strategy)} The same command goes on") from (failure or error)
     if failure is not None:
         raise failure
     for rank, said in enumerate(words):

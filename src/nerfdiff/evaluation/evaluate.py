@@ -9,15 +9,18 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from rich.console import Console
 
+from nerfdiff.data.datamodule import SceneDataModule
+from nerfdiff.data.scene import MissingSplit
 from nerfdiff.distill.baselines import CopyInput, MeanImage, mean_training_image
 from nerfdiff.distill.strategy import Strategy
 from nerfdiff.evaluation.dashboard import show_in_dashboard
 from nerfdiff.evaluation.measure import measure, record_failure
 from nerfdiff.evaluation.pictures import sheet, video
-from nerfdiff.evaluation.predict import predict, require_all
+from nerfdiff.evaluation.predict import done, predict, require_all
 from nerfdiff.evaluation.subject import choose_device, dataset_subject
 from nerfdiff.results.row import ResultRow
 from nerfdiff.results.table import rich_table, write_markdown
+from nerfdiff.stopping import Stopped
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +34,7 @@ def evaluate(cfg: DictConfig) -> list[ResultRow]:
     predicted again.
 
     Returns:
-        the strategy's row, then the baselines'.
+        the strategy's row, then the baselines'; of these the mean image only where there are training images.
 
     Raises:
         UserError: bad data, config or checkpoint. A strategy that fails is appended as a row with its status first.
@@ -40,10 +43,7 @@ def evaluate(cfg: DictConfig) -> list[ResultRow]:
         torch.set_num_threads(cfg.threads)
     subject = dataset_subject(cfg, choose_device(cfg.device))
     reader = subject.data.reader("test")
-    strategies: list[Strategy] = [instantiate(cfg.strategy)]
-    if cfg.baselines:
-        mean = mean_training_image(subject.data.reader("train"), cfg.mean_image_scenes, cfg.seed)
-        strategies += [CopyInput(), MeanImage(mean)]
+    strategies: list[Strategy] = [instantiate(cfg.strategy), *(_baselines(cfg, subject.data) if cfg.baselines else ())]
     scorer = instantiate(cfg.metrics)
     rows = []
     for strategy in strategies:
@@ -51,6 +51,8 @@ def evaluate(cfg: DictConfig) -> list[ResultRow]:
             predict(subject, strategy)
             require_all(subject, strategy)
             rows.append(measure(subject, strategy, scorer, reader))
+        except Stopped as stopped:
+            raise Stopped(stopped.signum, done(subject, strategy)) from None
         except Exception as error:
             record_failure(cfg, error, subject, strategy)
             raise
@@ -62,6 +64,16 @@ def evaluate(cfg: DictConfig) -> list[ResultRow]:
     show(rows, subject.folder / "table.md")
     log.info("rows: %s   scores per image and scene: %s", cfg.results, subject.folder / "scores")
     return rows
+
+
+def _baselines(cfg: DictConfig, data: SceneDataModule) -> list[Strategy]:
+    """What knows nothing of 3D; without the mean training image where only the test split was downloaded."""
+    try:
+        reader = data.reader("train")
+    except MissingSplit as error:
+        log.warning("the baseline mean_image is left out: it needs training images, and there are none (%s)", error)
+        return [CopyInput()]
+    return [CopyInput(), MeanImage(mean_training_image(reader, cfg.mean_image_scenes, cfg.seed))]
 
 
 def show(rows: list[ResultRow], path: Path) -> None:

@@ -1,19 +1,22 @@
 """Predictions to a row of results."""
 
+import json
 import logging
 import os
 import shlex
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
+import filelock
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from nerfdiff.cli import command_words
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.distill.strategy import Strategy
-from nerfdiff.errors import ConfigError, TimeUp
+from nerfdiff.errors import ConfigError, TimeUp, is_out_of_memory
 from nerfdiff.evaluation.costs import cost_fields, model_fields
 from nerfdiff.evaluation.dashboard import show_in_dashboard
 from nerfdiff.evaluation.subject import Subject, choose_device
@@ -28,7 +31,10 @@ log = logging.getLogger(__name__)
 
 
 def measure(subject: Subject, strategy: Strategy, scorer: Scorer, reader: SceneReader) -> ResultRow:
-    """Score the predictions of one strategy and append its row; one that has no model is timed by nothing."""
+    """Score the predictions of one strategy and append its row; one that has no model is timed by nothing.
+
+    Of several processes that made the scenes side by side, the first appends the row.
+    """
     scores = subject.folder / "scores" / strategy.name
     summary = scorer.score(subject.predictions / strategy.name, truth_from(reader), scores, subject.device)
     row = replace(_identified(subject, strategy), **summary, **cost_fields(subject, strategy))
@@ -36,8 +42,27 @@ def measure(subject: Subject, strategy: Strategy, scorer: Scorer, reader: SceneR
         log.warning("%s %s of %d", strategy.name, row.error, row.n_scenes)
         # where every scene fell back, the numbers are of the fields that distillation began with
         row = replace(row, status="diverged" if row.fallbacks == row.n_scenes else "ok")
-    append_row(subject.cfg.results, row)
+    with filelock.FileLock(subject.folder / ".row.lock"):
+        if _is_appended(subject, row):
+            log.info("another process, which made these scenes too, has appended the row of %s", row.run_id)
+        else:
+            append_row(subject.cfg.results, row)
     return row
+
+
+def _is_appended(subject: Subject, row: ResultRow) -> bool:
+    """Whether a row like this one was appended since this run began."""
+    results = Path(subject.cfg.results)
+    if not results.is_file():
+        return False
+    with open(results, "rb") as file:
+        file.seek(subject.rows_before)
+        for line in file:
+            with suppress(ValueError):
+                other = json.loads(line)
+                if isinstance(other, dict) and (other.get("run_id"), other.get("status")) == (row.run_id, row.status):
+                    return True
+    return False
 
 
 def record_failure(cfg: DictConfig, error: Exception, subject: Subject | None, strategy: Strategy | None) -> ResultRow:
@@ -50,7 +75,7 @@ def record_failure(cfg: DictConfig, error: Exception, subject: Subject | None, s
     status = "error"
     if isinstance(error, NonFinitePrediction):
         status = "nan"
-    elif isinstance(error, torch.cuda.OutOfMemoryError | MemoryError):
+    elif is_out_of_memory(error):
         status = "oom"
     elif isinstance(error, TimeUp):
         status = "timeout"
@@ -72,7 +97,6 @@ def _identified(subject: Subject, strategy: Strategy) -> ResultRow:
         folder=os.path.relpath(subject.folder, Path(cfg.results).parent),
         strategy=strategy.name,
         prior=prior and type(prior).__name__,
-        K=prior and prior.views,
         **_asked_for(cfg),
         **environment(subject.device, subject.precision),
         **{key: subject.identity[key] for key in ("ckpt_sha256", "weights", "split_sha256", "image_size")},
@@ -88,8 +112,8 @@ def _asked_for(cfg: DictConfig) -> dict[str, Any]:
 
 
 def _command(hydra: DictConfig) -> str:
-    """The shell command that does what this job does, from the project's folder."""
-    words = ["python", f"src/{hydra.job.config_name}.py"]
+    """The shell command that does what this job does, from the project's folder or as installed."""
+    words = command_words(hydra.job.config_name)
     if any(word.startswith("sweep=") for word in hydra.overrides.task):
         words.append("hydra.mode=RUN")  # the settings of a sweep's jobs, and not the sweep again
     return shlex.join([*words, *hydra.overrides.task])

@@ -1,10 +1,10 @@
 """Scene after scene: predictions, and what is left beside them."""
 
 import json
+import logging
 import math
-import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import islice
@@ -12,16 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from nerfdiff.callbacks.distillation_bar import DistillationBar
 from nerfdiff.cpu_memory import peak_memory
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.field_file import FIELD, SavedField, load_field, save_field
 from nerfdiff.distill.strategy import Strategy, Views
 from nerfdiff.distill.trace import PLOT, TRACE, plot_trace, write_trace
-from nerfdiff.errors import ConfigError, TimeUp
+from nerfdiff.errors import ConfigError, TimeUp, some
+from nerfdiff.evaluation.progress import SceneProgress
 from nerfdiff.evaluation.subject import Subject
 from nerfdiff.metrics.image import psnr
 from nerfdiff.metrics.predictions import SCENE, PredictionWriter
@@ -30,6 +28,8 @@ from nerfdiff.results.pictures import orbit_video
 from nerfdiff.results.timing import PartClock, Stopwatch
 
 ORBIT = "orbit.mp4"
+
+log = logging.getLogger(__name__)
 
 
 def predict(subject: Subject, strategy: Strategy, rank: int = 0, processes: int = 1) -> None:
@@ -47,35 +47,46 @@ def predict(subject: Subject, strategy: Strategy, rank: int = 0, processes: int 
         raise ConfigError(f"minutes={minutes} must be more than 0, or null")
     until = math.inf if minutes is None else time.monotonic() + 60 * minutes
     writer = _writer(subject, strategy)
-    to_do = set(writer.pending())
-    pending = [scene for scene in writer.scenes[rank::processes] if scene in to_do]
+    share = writer.scenes[rank::processes]
     if subject.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(subject.device)
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[told]}"),
-        disable=rank > 0 or not sys.stderr.isatty(),
-        console=Console(stderr=True),
-    ) as bar:
-        task = bar.add_task(strategy.name, total=len(pending), told="")
-        # to tell how far it is, the host waits for the device: not where nobody looks
-        callbacks = [] if bar.disable else [DistillationBar(lambda told: bar.update(task, told=told))]
-        warm = False
-        loaded = iter(subject.load(pending)) if pending else iter(())
-        while scenes := [scene.to(subject.device) for scene in islice(loaded, subject.cfg.scenes_at_once)]:
-            watch, clock = Stopwatch(subject.device), PartClock(subject.device)
-            with watch.measure(), clock.running(), subject.autocast():
-                predicted = strategy.predict(subject.model, scenes, subject.cfg.seed, callbacks)
-            spent = _shares(watch.seconds[0], clock.seconds(), predicted) | {"warm": warm}
-            warm = True
-            for scene, views in zip(scenes, predicted, strict=True):
-                score = _write(subject, strategy, writer, scene, views, spent)
-                bar.update(task, advance=1, told="" if score is None else f"PSNR {score:.2f}")
-            if time.monotonic() > until:
-                break
+    to_do = set(writer.pending()).intersection(share)
+    warm = False
+    with SceneProgress(strategy.name, len(to_do), subject.cfg.progress_every if rank == 0 else None) as progress:
+        # what another process is making comes last: by then it is done, or to be waited for
+        for wait in (False, True):
+            for group in _claimed(subject, writer, share, wait):
+                scenes = [scene.to(subject.device) for scene in group]
+                callbacks = progress.callbacks(len(scenes))
+                watch, clock = Stopwatch(subject.device), PartClock(subject.device)
+                with watch.measure(), clock.running(), subject.autocast():
+                    predicted = strategy.predict(subject.model, scenes, subject.cfg.seed, callbacks)
+                spent = _shares(watch.seconds[0], clock.seconds(), predicted) | {"warm": warm}
+                warm = True
+                for scene, views in zip(scenes, predicted, strict=True):
+                    score = _write(subject, strategy, writer, scene, views, spent)
+                    writer.release(scene.scene_ids[0])
+                    progress.advance("" if score is None else f"PSNR {score:.2f}")
+                if time.monotonic() > until:
+                    return
+
+
+def _claimed(subject: Subject, writer: PredictionWriter, share: Sequence[str], wait: bool) -> Iterator[list[ViewBatch]]:
+    """Groups of scenes that are fitted together, of those still to do that no other process makes."""
+    to_do = set(writer.pending())
+    pending = [scene for scene in share if scene in to_do]
+    if wait and pending:
+        log.info("another process is making %s: waiting for it", some(pending))
+    loaded = (scene for scene in (subject.load(pending) if pending else ()) if writer.claim(scene.scene_ids[0], wait))
+    while group := list(islice(loaded, 1 if wait else subject.cfg.scenes_at_once)):
+        yield group
+
+
+def done(subject: Subject, strategy: Strategy) -> str:
+    """A sentence on how many scenes are complete."""
+    writer = _writer(subject, strategy)
+    total = len(writer.scenes)
+    return f"{total - len(writer.pending())} of {total} scenes of {strategy.name} are saved in {writer.folder}."
 
 
 def require_all(subject: Subject, strategy: Strategy) -> None:
@@ -121,6 +132,7 @@ def _write(
             "peak_mem_bytes": _peak_memory(subject.device),
             "denoiser_calls": views.denoiser_calls,
             "field_queries": views.field_queries,
+            "virtual_views": views.virtual_views,
         },
         status=views.status,
         beside=partial(_leave, subject, strategy, scene, views),

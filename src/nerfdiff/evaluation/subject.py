@@ -1,5 +1,6 @@
 """What is evaluated on what: a model, scenes, and all that predictions of one run share."""
 
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
@@ -21,6 +22,8 @@ from nerfdiff.results.environment import hardware
 from nerfdiff.results.hashes import sha256_file, sha256_values
 from nerfdiff.training import auto_precision, plain
 
+log = logging.getLogger(__name__)
+
 PRECISIONS = ("32-true", "bf16-mixed")
 
 
@@ -36,6 +39,7 @@ class Subject:
         stability: of the model's training, see `LoadedModel`.
         conditions: a digest of what changes what scenes cost, and their numbers by rounding at most: hardware, threads,
             scenes at once, the renderer's chunks and the memory layout.
+        rows_before: bytes of the file of results before this run.
         data: where the scenes come from; None for a picture, whose other views nobody knows.
     """
 
@@ -49,6 +53,7 @@ class Subject:
     folder: Path
     stability: Mapping[str, float | int | None]
     conditions: str
+    rows_before: int
     data: SceneDataModule | None
 
     @property
@@ -88,6 +93,7 @@ def dataset_subject(cfg: DictConfig, device: torch.device) -> Subject:
         UserError: bad data, config or checkpoint.
     """
     loaded = load_model(cfg.ckpt, cfg.weights, cfg.paths.assets_dir)
+    log.info("ckpt=%s", loaded.describe())
     datamodule = instantiate(cfg.data)
     datamodule.setup("test")
     reader = datamodule.reader("test")
@@ -122,6 +128,7 @@ def picture_subject(cfg: DictConfig, device: torch.device) -> Subject:
         UserError: bad picture, config or checkpoint.
     """
     loaded = load_model(cfg.ckpt, cfg.weights, cfg.paths.assets_dir)
+    log.info("ckpt=%s", loaded.describe())
     size = loaded.image_size or plain(cfg.picture_size)
     if size is None:
         raise ConfigError(f"{loaded.path} does not say what image size it is for: give picture_size=[height,width]")
@@ -132,6 +139,7 @@ def picture_subject(cfg: DictConfig, device: torch.device) -> Subject:
     names = tuple(f"{view:03d}" for view in range(cameras.shape[1]))
     scene = replace(scene, target_cameras=cameras, target_pixels=blank, target_views=(names,))
     facts = {
+        "split_sha256": sha256_values(list(scene.scene_ids)),
         "files_sha256": [sha256_file(file) for file in (cfg.image, cfg.picture.mask) if file],
         "picture": plain(cfg.picture),
         "picture_views": plain(cfg.picture_views),
@@ -187,4 +195,18 @@ def _subject(
     compile_unets(model, cfg.compile, cfg.paths.compiled_dir)
     spent_on = [hardware(device), cfg.threads, cfg.scenes_at_once, model.renderer.chunk, in_pixels]
     conditions = sha256_values(spent_on)[:8]
-    return Subject(cfg, model, load, scene_ids, device, precision, identity, folder, loaded.stability, conditions, data)
+    results = Path(cfg.results)
+    return Subject(
+        cfg=cfg,
+        model=model,
+        load=load,
+        scene_ids=scene_ids,
+        device=device,
+        precision=precision,
+        identity=identity,
+        folder=folder,
+        stability=loaded.stability,
+        conditions=conditions,
+        rows_before=results.stat().st_size if results.is_file() else 0,
+        data=data,
+    )

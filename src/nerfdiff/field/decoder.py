@@ -17,7 +17,7 @@ class Decoder(nn.Module):
     Args:
         channels: feature channels of the triplane.
         hidden: width of the hidden layer.
-        density_shift: added before the softplus, so that space starts out nearly empty.
+        density_shift: added before the softplus; with `density_scale` it sets how opaque space starts out.
         density_scale: density in units of 1 / (t_f − t_n) where the softplus gives 1; making density relative to
             the frustum's depth frees the network from the scene's units.
     """

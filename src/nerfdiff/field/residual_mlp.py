@@ -62,7 +62,7 @@ class ResidualMLP(nn.Module):
         self.position = _he(nn.Linear(3 * (1 + 2 * frequencies) + 3, hidden))
         self.features = nn.ModuleList(_he(nn.Linear(channels, hidden)) for _ in range(injections))
         self.blocks = nn.ModuleList(ResidualBlock(hidden) for _ in range(blocks))
-        self.output = nn.Linear(hidden, 4)  # not He's weights: space starts nearly empty, as density_shift has it
+        self.output = nn.Linear(hidden, 4)  # not He's weights: density starts as density_shift has it
 
     def forward(
         self,

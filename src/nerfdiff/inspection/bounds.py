@@ -60,6 +60,7 @@ class Bounds:
     higher_is_better: ClassVar[bool] = False
     judges_cameras: ClassVar[bool] = False
     matches_images: ClassVar[bool] = False
+    tells_focal: ClassVar[bool] = False
     fallback: ClassVar[bool] = False
 
     def __call__(self, scene: Scene) -> Finding:

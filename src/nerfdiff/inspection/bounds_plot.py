@@ -9,6 +9,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from nerfdiff.results.files import atomic
+from nerfdiff.results.text import figure_text
 
 INSIDE, OUTSIDE = "#4c78a8", "#d62728"
 
@@ -55,7 +56,7 @@ def write_bounds_plot(path: Path, scenes: Sequence[Distances], title: str, bins:
     what = "distance along the ray of what pixels hit" if surfaces else "distance of cameras from what they look at"
     axes.set_xlabel(f"{what}, {'scene units' if shared else 'from near (0) to far (1) of each scene'}")
     axes.set_ylabel("share of the pixels, %" if surfaces else "share of the cameras, %")
-    axes.set_title(title, fontsize=11)
+    axes.set_title(figure_text(title), fontsize=11)
     axes.margins(x=0.12, y=0.15)
     with atomic(path) as temporary:
         figure.savefig(temporary, dpi=dpi)

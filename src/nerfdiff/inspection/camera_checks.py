@@ -33,6 +33,7 @@ class Intrinsics:
     higher_is_better: ClassVar[bool] = False
     judges_cameras: ClassVar[bool] = True
     matches_images: ClassVar[bool] = False
+    tells_focal: ClassVar[bool] = False
     fallback: ClassVar[bool] = False
 
     def __call__(self, scene: Scene) -> Finding:
@@ -79,6 +80,7 @@ class Poses:
     higher_is_better: ClassVar[bool] = False
     judges_cameras: ClassVar[bool] = True
     matches_images: ClassVar[bool] = False
+    tells_focal: ClassVar[bool] = False
     fallback: ClassVar[bool] = False
 
     def __call__(self, scene: Scene) -> Finding:
@@ -120,6 +122,7 @@ class OpticalAxes:
     higher_is_better: ClassVar[bool] = False
     judges_cameras: ClassVar[bool] = True
     matches_images: ClassVar[bool] = False
+    tells_focal: ClassVar[bool] = False
     fallback: ClassVar[bool] = False
 
     def __call__(self, scene: Scene) -> Finding:

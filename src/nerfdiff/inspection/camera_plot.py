@@ -15,6 +15,7 @@ from nerfdiff.cameras import Cameras
 from nerfdiff.inspection.camera_checks import turn
 from nerfdiff.orbit import look_at_point
 from nerfdiff.results.files import atomic
+from nerfdiff.results.text import figure_text
 
 CAMERA, INPUT, LOOK, UP = "#44546a", "#d6278f", "#a9b4c0", "#e08a00"
 WORLD = ("#d62728", "#2ca02c", "#1f5fd0")
@@ -55,7 +56,7 @@ def write_camera_plot(
     if not scenes:
         return None
     figure = Figure(figsize=(15, 7.2), layout="constrained")
-    figure.suptitle(title, fontsize=13)
+    figure.suptitle(figure_text(title), fontsize=13)
     left = figure.add_subplot(1, 2, 1, projection="3d")
     right = figure.add_subplot(1, 2, 2, projection="3d")
     _draw_frustums(left, scenes[0], max_frustums, frustum_size)
@@ -89,7 +90,7 @@ def _draw_frustums(axes: Axes3D, scene: PlottedCameras, limit: int, size: float)
     axes.plot([], [], color=LOOK, label="optical axes")
     _world_axes(axes, 0.4 * scene.scale)
     _equal(axes, np.concatenate([scene.cameras.centres.double().numpy(), centre[None], np.zeros((1, 3))]), pad=length)
-    axes.set_title(f"scene {scene.scene}: in the dataset's world", fontsize=11)
+    axes.set_title(figure_text(f"scene {scene.scene}: in the dataset's world"), fontsize=11)
     axes.legend(loc="upper left", fontsize=8, framealpha=0.8)
 
 

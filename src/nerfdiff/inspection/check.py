@@ -35,21 +35,31 @@ class Finding:
 
 
 @runtime_checkable
-class Check(Protocol):
-    """A property that every scene should have.
+class Measure(Protocol):
+    """How findings are judged together.
 
-    `measures` says what the value of its findings is; `higher_is_better` how to read it; `tolerated` is the share of
-    scenes that may fail before the split does; `judges_cameras` whether wrong cameras are what makes it fail;
-    `matches_images` whether it compares cameras with what the images show; `fallback` checks are made only where no
-    other with `matches_images` could be.
+    `measures` says what their values are; `higher_is_better` how to read them; `tolerated` is the share of scenes that
+    may fail before the split does.
     """
 
     measures: str
     higher_is_better: bool
+    tolerated: float
+
+
+@runtime_checkable
+class Check(Measure, Protocol):
+    """A property that every scene should have.
+
+    `judges_cameras` says whether wrong cameras are what makes it fail; `matches_images` whether it compares cameras
+    with what the images show, and then `tells_focal` whether it notices a wrong focal length; `fallback` checks are
+    made only where no other with `matches_images` could be.
+    """
+
     judges_cameras: bool
     matches_images: bool
+    tells_focal: bool
     fallback: bool
-    tolerated: float
 
     def __call__(self, scene: Scene) -> Finding: ...
 
@@ -84,7 +94,7 @@ class Verdict:
     suspects: Mapping[str, str]
 
 
-def verdict(name: str, check: Check, findings: Mapping[str, Finding]) -> Verdict:
+def verdict(name: str, check: Measure, findings: Mapping[str, Finding]) -> Verdict:
     """What the findings of a split's scenes, by scene id, come to."""
     made = {scene: finding for scene, finding in findings.items() if finding.status is not Status.UNCHECKED}
     if not made:

@@ -44,6 +44,7 @@ class DepthAgreement:
     higher_is_better: ClassVar[bool] = True
     judges_cameras: ClassVar[bool] = True
     matches_images: ClassVar[bool] = True
+    tells_focal: ClassVar[bool] = True
     fallback: ClassVar[bool] = False
 
     def __call__(self, scene: Scene) -> Finding:

@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.data.scene import MissingSplit, SceneReader
 from nerfdiff.errors import DataError
+from nerfdiff.inspection.all_views import StrayCameras
 from nerfdiff.inspection.bounds_plot import Distances, write_bounds_plot
 from nerfdiff.inspection.camera_plot import PlottedCameras, write_camera_plot
 from nerfdiff.inspection.check import Check
@@ -31,12 +32,14 @@ def inspect_data(cfg: DictConfig) -> list[SplitSummary]:
         a summary for each of train, val and test.
 
     Raises:
-        DataError: no split can be read; or, after the report is written, a check failed or a scene is bad.
+        DataError: no split can be read; or, after the report is written, a check failed, a scene is bad, or nothing
+            could tell whether cameras fit images (unless `cfg.allow_unchecked`).
     """
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
     datamodule: SceneDataModule = instantiate(cfg.data)
     checks: dict[str, Check] = {name: instantiate(check) for name, check in cfg.checks.items() if check is not None}
+    strays: StrayCameras | None = instantiate(cfg.stray_cameras)
     folder, console = Path(cfg.paths.output_dir), Console(width=None if sys.stdout.isatty() else 200)
     readers, summaries, errors = {}, {}, []
     for stage in datamodule.splits:
@@ -49,14 +52,14 @@ def inspect_data(cfg: DictConfig) -> list[SplitSummary]:
     if not readers:
         raise errors[0]
     for stage, reader in readers.items():
-        survey = _survey(cfg, datamodule, stage, reader, checks)
-        summaries[stage] = summarise_split(survey, checks, _pictures(cfg, survey, folder))
+        survey = _survey(cfg, datamodule, stage, reader, checks, strays)
+        summaries[stage] = summarise_split(survey, checks, strays, _pictures(cfg, survey, folder), cfg.allow_unchecked)
     splits = [summaries[stage] for stage in datamodule.splits]
     title = f"{datamodule.name} in {Path(datamodule.root).resolve()}"
     report = write_report(folder, title, splits)
     print_report(console, title, splits, cfg.listed)
     pictures = [folder / name for split in splits for name in split.pictures.values()]
-    console.print("Open:", *(f"  {path}" for path in [*report, *pictures]), sep="\n", soft_wrap=True)
+    console.print("Open:", *(f"  {path}" for path in [*report, *pictures]), sep="\n", soft_wrap=True, markup=False)
     failures = [f"{split.stage}: {', '.join(split.failures)}" for split in splits if split.failures]
     if failures:
         raise DataError(f"{datamodule.root}: {'; '.join(failures)}; see {report[0]}")
@@ -64,7 +67,12 @@ def inspect_data(cfg: DictConfig) -> list[SplitSummary]:
 
 
 def _survey(
-    cfg: DictConfig, datamodule: SceneDataModule, stage: str, reader: SceneReader, checks: dict[str, Check]
+    cfg: DictConfig,
+    datamodule: SceneDataModule,
+    stage: str,
+    reader: SceneReader,
+    checks: dict[str, Check],
+    strays: StrayCameras | None,
 ) -> SplitSurvey:
     sources = {
         "train": datamodule.train_source_view,
@@ -74,7 +82,7 @@ def _survey(
     sample = Sample(
         cfg.sample.scenes, cfg.sample.views, cfg.bounds_plot.distances, cfg.sheet.scenes, cfg.sheet.views, cfg.seed
     )
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     steps = len(reader) + len(sampled(len(reader), cfg.sample.scenes, ""))
     with Progress(*columns, disable=not sys.stderr.isatty(), console=Console(stderr=True)) as bar:
         task = bar.add_task(f"{stage}: listing and reading scenes", total=steps)
@@ -85,6 +93,7 @@ def _survey(
             sources[stage],
             sample,
             checks,
+            strays,
             lambda: bar.update(task, advance=1),
         )
 

@@ -52,6 +52,7 @@ class Matches:
     higher_is_better: ClassVar[bool] = True
     judges_cameras: ClassVar[bool] = True
     matches_images: ClassVar[bool] = True
+    tells_focal: ClassVar[bool] = True
     fallback: ClassVar[bool] = True
 
     def __call__(self, scene: Scene) -> Finding:

@@ -11,6 +11,7 @@ from rich.table import Table
 from nerfdiff.inspection.check import Status
 from nerfdiff.inspection.summary import SplitSummary
 from nerfdiff.results.files import write_text
+from nerfdiff.results.text import markdown_cell, one_line
 
 COLOURS = {Status.OK: "green", Status.FAILED: "bold red", Status.UNCHECKED: "yellow"}
 FACTS = ("split", "scenes", "views per scene", "read", "height x width", "focal length, px", "field of view, °",
@@ -31,21 +32,26 @@ def _some_of(count: int, total: int) -> str:
     return "no" if count == 0 else "yes" if count == total else f"{count} of {total}"
 
 
+def _told(text: str) -> str:
+    """For the terminal: names of data are no markup."""
+    return escape(one_line(text))
+
+
 def print_report(console: Console, title: str, splits: Sequence[SplitSummary], limit: int) -> None:
     """Tables of facts and of checks, then bad and suspect scenes (at most `limit` of each split)."""
     there = [split for split in splits if not split.absent and not split.error]
-    table = Table(title=title)
+    table = Table(title=_told(title))
     for heading in FACTS:
         table.add_column(heading)
     for split in there:
-        table.add_row(*map(escape, facts(split)))
+        table.add_row(*map(_told, facts(split)))
     checks = Table()
     for heading in ("split", "check", "result", "found"):
         checks.add_column(heading)
     for split in there:
         for found in split.checks:
             colour = COLOURS[found.status]
-            checks.add_row(split.stage, found.check, f"[{colour}]{found.status}[/]", escape(found.text))
+            checks.add_row(split.stage, found.check, f"[{colour}]{found.status}[/]", _told(found.text))
         checks.add_section()
     if there:
         console.print(table, checks)
@@ -53,15 +59,15 @@ def print_report(console: Console, title: str, splits: Sequence[SplitSummary], l
         if split.absent or split.error:
             colour = "yellow" if split.absent else "bold red"
             state = "not there" if split.absent else "cannot be read"
-            console.print(f"[{colour}]{split.stage}: {state}[/]: {escape(split.absent or split.error)}", soft_wrap=True)
+            console.print(f"[{colour}]{split.stage}: {state}[/]: {_told(split.absent or split.error)}", soft_wrap=True)
         for scene, reason in list(split.bad.items())[:limit]:
-            console.print(f"[bold red]bad scene[/] {split.stage} {escape(f'{scene}: {reason}')}", soft_wrap=True)
+            console.print(f"[bold red]bad scene[/] {split.stage} {_told(f'{scene}: {reason}')}", soft_wrap=True)
         if len(split.bad) > limit:
             console.print(f"  and {len(split.bad) - limit} more bad scenes, all in the report")
         for line in _suspects(split)[:limit]:
-            console.print(f"[yellow]suspect[/] {split.stage} {escape(line)}", soft_wrap=True)
+            console.print(f"[yellow]suspect[/] {split.stage} {_told(line)}", soft_wrap=True)
         for line in _notes(split):
-            console.print(f"[bold]{split.stage}[/]: {escape(line)}", soft_wrap=True)
+            console.print(f"[bold]{split.stage}[/]: {_told(line)}", soft_wrap=True)
 
 
 def write_report(folder: Path, title: str, splits: Sequence[SplitSummary]) -> list[Path]:
@@ -77,19 +83,21 @@ def write_report(folder: Path, title: str, splits: Sequence[SplitSummary]) -> li
 def markdown(title: str, splits: Sequence[SplitSummary]) -> str:
     """The whole report, with the pictures by name."""
     there = [split for split in splits if not split.absent and not split.error]
-    parts = [f"# {title}\n"]
+    parts = [f"# {markdown_cell(title)}\n"]
     if there:
-        parts.append(_table(FACTS, [facts(split) for split in there]))
+        parts.append(_table(FACTS, [list(map(markdown_cell, facts(split))) for split in there]))
     for split in splits:
         parts.append(f"## {split.stage}\n")
         if split.absent or split.error:
-            parts.append(f"{'Not there' if split.absent else 'Cannot be read'}: {split.absent or split.error}\n")
+            state = "Not there" if split.absent else "Cannot be read"
+            parts.append(f"{state}: {markdown_cell(split.absent or split.error)}\n")
             continue
-        rows = [[found.check, f"**{found.status}**", found.text] for found in split.checks]
+        rows = [[found.check, f"**{found.status}**", markdown_cell(found.text)] for found in split.checks]
         parts.append(_table(("check", "result", "found"), rows))
         parts += [f"{line}\n" for line in _notes(split)]
-        bad = [f"- {scene}: {reason}" for scene, reason in split.bad.items()]
-        for heading, lines in (("Bad scenes", bad), ("Suspect scenes", [f"- {line}" for line in _suspects(split)])):
+        bad = [f"- {markdown_cell(f'{scene}: {reason}')}" for scene, reason in split.bad.items()]
+        suspects = [f"- {markdown_cell(line)}" for line in _suspects(split)]
+        for heading, lines in (("Bad scenes", bad), ("Suspect scenes", suspects)):
             if lines:
                 parts.append(f"### {heading}\n\n" + "\n".join(lines) + "\n")
         parts += [f"![{split.stage}, {what}]({name})\n" for what, name in split.pictures.items()]
@@ -97,13 +105,23 @@ def markdown(title: str, splits: Sequence[SplitSummary]) -> str:
 
 
 def _notes(split: SplitSummary) -> list[str]:
+    notes = []
     if split.scenes_read and not split.compared:
-        return ["not checked whether cameras fit the images: there is no depth, silhouette or texture to tell by"]
+        notes = [
+            "cameras unchecked: there is no depth, silhouette or texture to tell by whether they fit the images; look "
+            "at the pictures" + ("" if split.allow_unchecked else ", then let them pass with allow_unchecked=true")
+        ]
+    elif split.compared < split.scenes_read:
+        notes = [f"cameras unchecked in {split.scenes_read - split.compared} of {split.scenes_read} scenes"]
+    if split.compared and not split.focal_told:
+        notes.append("focal length unchecked: silhouettes hardly change with it; compare it with the data's source")
     if split.explanations is None or not any(found.status is Status.FAILED for found in split.checks):
-        return []  # a few suspects are no reason to doubt all cameras
+        return notes  # a few suspects are no reason to doubt all cameras
     if not split.explanations:
-        return ["no common misreading of cameras (axes, inverse, transposed, other resolution) explains the failure"]
-    return [f"every check of the cameras would pass if {name}" for name in split.explanations]
+        notes.append(
+            "no common misreading of cameras (axes, inverse, transposed, other resolution) explains the failure"
+        )
+    return notes + [f"every check of the cameras would pass if {name}" for name in split.explanations]
 
 
 def _suspects(split: SplitSummary) -> list[str]:
@@ -112,7 +130,7 @@ def _suspects(split: SplitSummary) -> list[str]:
 
 def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [headings, ["---"] * len(headings), *rows]
-    return "".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |\n" for line in lines)
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
 def _plain(value):

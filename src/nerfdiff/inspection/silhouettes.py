@@ -54,6 +54,7 @@ class Silhouettes:
     higher_is_better: ClassVar[bool] = True
     judges_cameras: ClassVar[bool] = True
     matches_images: ClassVar[bool] = True
+    tells_focal: ClassVar[bool] = False
     fallback: ClassVar[bool] = False
 
     def __call__(self, scene: Scene) -> Finding:

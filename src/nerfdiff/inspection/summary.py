@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from nerfdiff.inspection.all_views import StrayCameras
 from nerfdiff.inspection.camera_checks import field_of_view
 from nerfdiff.inspection.check import Check, Status, Verdict, verdict
 from nerfdiff.inspection.survey import SceneRecord, SplitSurvey
@@ -40,7 +41,9 @@ class SplitSummary:
         sizes: "height x width" to how many scenes.
         focal: in pixels, along x; `fov` in degrees across the larger side.
         masks, depths: how many of the scenes read have them.
-        compared: whether some check could compare cameras with images.
+        compared: for how many of the scenes read some check could compare cameras with images.
+        focal_told: whether one of those checks notices a wrong focal length.
+        allow_unchecked: whether the split may pass where none was compared.
     """
 
     stage: str
@@ -59,7 +62,9 @@ class SplitSummary:
     masks: int = 0
     depths: int = 0
     checks: tuple[Verdict, ...] = ()
-    compared: bool = False
+    compared: int = 0
+    focal_told: bool = False
+    allow_unchecked: bool = False
     bad: dict[str, str] = field(default_factory=dict)
     explanations: list[str] | None = None
     pictures: dict[str, str] = field(default_factory=dict)
@@ -69,17 +74,30 @@ class SplitSummary:
         """What is wrong with the split, in a few words each."""
         failed = [f"{check.check} failed" for check in self.checks if check.status is Status.FAILED]
         bad = [f"{len(self.bad)} bad scene{'s' if len(self.bad) > 1 else ''}"] if self.bad else []
-        return ([self.error] if self.error else []) + failed + bad
+        unchecked = self.scenes_read and not self.compared and not self.allow_unchecked
+        return ([self.error] if self.error else []) + failed + bad + (["cameras unchecked"] if unchecked else [])
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         return asdict(self)
 
 
-def summarise_split(survey: SplitSurvey, checks: Mapping[str, Check], pictures: Mapping[str, str]) -> SplitSummary:
+def summarise_split(
+    survey: SplitSurvey,
+    checks: Mapping[str, Check],
+    strays: StrayCameras | None,
+    pictures: Mapping[str, str],
+    allow_unchecked: bool,
+) -> SplitSummary:
     records: list[SceneRecord] = survey.records
     findings = {name: {record.id: record.findings[name] for record in records} for name in checks}
-    verdicts = tuple(verdict(name, check, findings[name]) for name, check in checks.items())
+    verdicts = [verdict(name, check, findings[name]) for name, check in checks.items()]
+    if strays is not None:
+        verdicts.insert(0, verdict("stray_cameras", strays, survey.strays))
+    comparing = [
+        {name for name, found in record.findings.items() if checks[name].matches_images and found.value is not None}
+        for record in records
+    ]
     return SplitSummary(
         stage=survey.stage,
         split=survey.split,
@@ -94,8 +112,10 @@ def summarise_split(survey: SplitSurvey, checks: Mapping[str, Check], pictures: 
         far=Range.of([r.far for r in records]),
         masks=sum(r.mask for r in records),
         depths=sum(r.depth for r in records),
-        checks=verdicts,
-        compared=any(checks[v.check].matches_images and v.status is not Status.UNCHECKED for v in verdicts),
+        checks=tuple(verdicts),
+        compared=sum(map(bool, comparing)),
+        focal_told=any(checks[name].tells_focal for names in comparing for name in names),
+        allow_unchecked=allow_unchecked,
         bad=dict(survey.bad),
         explanations=survey.explanations,
         pictures=dict(pictures),

@@ -11,6 +11,7 @@ from nerfdiff.cameras import Cameras
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.data.views import position_of, spread
 from nerfdiff.errors import UserError
+from nerfdiff.inspection.all_views import StrayCameras, refuse_missing_files
 from nerfdiff.inspection.bounds import scene_distances
 from nerfdiff.inspection.check import Check, Finding, Status, check_scene
 from nerfdiff.inspection.conventions import explanations
@@ -46,6 +47,7 @@ class SplitSurvey:
 
     Args:
         views: views per scene, of all scenes that could be listed.
+        strays: what `StrayCameras` found in each of these.
         bad: the error of each scene that could not be listed or read.
         explanations: misreadings that would explain the first failure, None where nothing failed.
     """
@@ -54,6 +56,7 @@ class SplitSurvey:
     split: str
     scenes: int
     views: list[int] = field(default_factory=list)
+    strays: dict[str, Finding] = field(default_factory=dict)
     records: list[SceneRecord] = field(default_factory=list)
     bad: dict[str, str] = field(default_factory=dict)
     explanations: list[str] | None = None
@@ -86,9 +89,10 @@ def survey_split(
     source_view: int | None,
     sample: Sample,
     checks: Mapping[str, Check],
+    stray_cameras: StrayCameras | None,
     advance: Callable[[], None],
 ) -> SplitSurvey:
-    """List all scenes of a split, read and check some; calls `advance` after each scene of both passes.
+    """List all views of all scenes of a split, read and check some; calls `advance` after each scene of both passes.
 
     Scenes that a `UserError` keeps from being read are recorded as bad.
 
@@ -101,6 +105,10 @@ def survey_split(
             survey.views.append(len(reader.view_names(index)))
             if source_view is not None:
                 position_of(reader, index, source_view)
+            listing = reader.listing(index)
+            refuse_missing_files(listing)
+            if stray_cameras is not None:
+                survey.strays[reader.scene_id(index)] = stray_cameras(listing)
         except UserError as error:
             survey.bad[reader.scene_id(index)] = str(error)
         advance()

@@ -23,13 +23,18 @@ def dequantise(images: UInt8[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
 def psnr(
     predictions: Float[Tensor, "n 3 h w"], truth: Float[Tensor, "n 3 h w"], floor: float = 1e-6
 ) -> Float64[Tensor, "n"]:
-    """Peak signal-to-noise ratio of each image in dB, −10 log10(MSE + floor).
+    """Peak signal-to-noise ratio of each image in dB, −10 log10 max(MSE, floor).
 
     Args:
         floor: keeps equal images (blank scenes) finite; 1e-6 caps the ratio at 60 dB.
     """
     mse = (predictions.double() - truth.double()).square().mean(dim=(1, 2, 3))
-    return -10 * torch.log10(mse + floor)
+    return psnr_of_mse(mse, floor)
+
+
+def psnr_of_mse(mse: Float[Tensor, "*n"], floor: float = 1e-6) -> Float[Tensor, "*n"]:
+    """`psnr` from mean squared errors."""
+    return -10 * torch.log10(mse.clamp_min(floor))
 
 
 def ssim(predictions: Float[Tensor, "n 3 h w"], truth: Float[Tensor, "n 3 h w"]) -> Float64[Tensor, "n"]:

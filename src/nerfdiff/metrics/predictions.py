@@ -10,13 +10,15 @@ A scene's folder appears under its name only when it is complete, so an interrup
 the next scene.
 """
 
+import fcntl
+import glob
 import json
 import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -26,7 +28,7 @@ from torch import Tensor
 
 from nerfdiff.errors import DataError
 from nerfdiff.metrics.image import quantise
-from nerfdiff.results.files import write_text
+from nerfdiff.results.files import publish, remove_leftovers, write_text
 
 FORMAT = 2
 PLAN = "plan.json"
@@ -76,11 +78,16 @@ class PredictionWriter:
     def __init__(self, root: str | Path, strategy: str, scenes: Sequence[str], identity: Mapping[str, Any]):
         self.folder = Path(root) / _name(strategy)
         self.scenes = tuple(_name(scene) for scene in scenes)
+        self._claims: IO[bytes] | None = None
         plan = {"format": FORMAT, "identity": json.loads(json.dumps(identity)), "scenes": list(self.scenes)}
-        if (self.folder / PLAN).exists():
+        if (self.folder / PLAN).exists() and not self._is_lost():
             self._check(plan)
         else:
             write_text(self.folder / PLAN, json.dumps(plan, indent=1) + "\n")
+
+    def _is_lost(self) -> bool:
+        """Whether a power cut left nothing of the plan, and nothing was made by it."""
+        return not (self.folder / PLAN).stat().st_size and not any(self.folder.glob(f"*/{SCENE}"))
 
     def _check(self, plan: dict[str, Any]) -> None:
         found = read_plan(self.folder)
@@ -101,6 +108,29 @@ class PredictionWriter:
     def pending(self) -> tuple[str, ...]:
         """Scenes not yet complete, in order."""
         return tuple(scene for scene in self.scenes if not (self.folder / scene / SCENE).exists())
+
+    def claim(self, scene: str, wait: bool = False) -> bool:
+        """Whether a scene is this process's to make, until it is released: none else makes it, and it is not complete.
+
+        Args:
+            wait: for another process to complete the scene, or to die over it.
+        """
+        if self._claims is None:
+            self._claims = open(self.folder / ".claims", "a+b")  # noqa: SIM115  (closing it releases all)
+        try:
+            # of each scene one byte, which may lie beyond the file's end
+            fcntl.lockf(self._claims, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB), 1, self.scenes.index(scene))
+        except (BlockingIOError, PermissionError):  # what a lock that another holds is, by POSIX
+            return False
+        if not (self.folder / scene / SCENE).exists():
+            remove_leftovers(self.folder, f"{glob.escape(scene)}.*")
+            return True
+        self.release(scene)
+        return False
+
+    def release(self, scene: str) -> None:
+        """Let other processes make a scene that was claimed."""
+        fcntl.lockf(self._claims, fcntl.LOCK_UN, 1, self.scenes.index(scene))
 
     def write(
         self,
@@ -159,7 +189,7 @@ class PredictionWriter:
             (partial / SCENE).write_text(json.dumps(facts, indent=1) + "\n")
             if final.exists():
                 shutil.rmtree(final)
-            partial.rename(final)
+            publish(partial, final)
         except OSError as error:
             raise DataError(
                 f"cannot write predictions to {final}: {error.strerror or error}; scenes before it are kept"

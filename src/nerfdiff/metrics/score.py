@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 from jaxtyping import UInt8
+from rich.markup import escape
 from rich.progress import track
 from torch import Tensor
 
@@ -53,7 +54,7 @@ class Scorer:
     Weight files are looked for at once, so that what will be missing is known before any model runs.
 
     Args:
-        psnr_floor: added to the MSE; 1e-6 caps PSNR at 60 dB.
+        psnr_floor: least MSE that PSNR counts; 1e-6 caps it at 60 dB.
         ssim_gaussian: also measure SSIM with an 11×11 Gaussian window.
         lpips: measure LPIPS with VGG16, if its weights are there.
         lpips_weights: path of torchvision's VGG16 weights; None looks in torch hub's cache.
@@ -119,7 +120,7 @@ class Scorer:
         quiet = not sys.stderr.isatty()
         scenes = [
             session.scene(number, folder, scene, truth)
-            for number, scene in enumerate(track(planned, f"scoring {folder.name}", disable=quiet))
+            for number, scene in enumerate(track(planned, escape(f"scoring {folder.name}"), disable=quiet))
         ]
         summary = summarise(scenes) | session.sets()
         summary["ssim_impl"] = image_metrics.SSIM_IMPL

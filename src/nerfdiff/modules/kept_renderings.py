@@ -1,6 +1,7 @@
 """Renderings of a frozen field, rendered once and kept on disk for the many times that the CDM trains on them."""
 
 import sqlite3
+import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from nerfdiff.errors import CheckpointError
 
-SCHEMA = "CREATE TABLE IF NOT EXISTS renderings (name TEXT PRIMARY KEY, pixels BLOB) WITHOUT ROWID"
+SCHEMA = "CREATE TABLE IF NOT EXISTS checked (name TEXT PRIMARY KEY, pixels BLOB, crc INTEGER) WITHOUT ROWID"
 
 
 class KeptRenderings:
@@ -57,18 +58,21 @@ class KeptRenderings:
         missing = []
         try:
             for position, name in enumerate(names):
-                found = self._file.execute("SELECT pixels FROM renderings WHERE name = ?", (name,)).fetchone()
+                found = self._file.execute("SELECT pixels, crc FROM checked WHERE name = ?", (name,)).fetchone()
                 if found is None:
                     missing.append(position)
                 else:
+                    if zlib.crc32(found[0]) != found[1]:
+                        raise ValueError(f"bytes of {name} changed since they were written")
                     pixels[position] = np.frombuffer(found[0], np.uint8).reshape(pixels.shape[1:])
             if missing:
                 fresh = (render(missing).clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
                 pixels[missing] = fresh
-                rows = [(names[position], image.tobytes()) for position, image in zip(missing, fresh, strict=True)]
+                images = [image.tobytes() for image in fresh]
+                rows = [(names[p], image, zlib.crc32(image)) for p, image in zip(missing, images, strict=True)]
                 with self._file:
-                    self._file.executemany("INSERT OR IGNORE INTO renderings VALUES (?, ?)", rows)
-        except (OSError, sqlite3.Error, ValueError) as error:  # a ValueError: an image of another size
+                    self._file.executemany("INSERT OR IGNORE INTO checked VALUES (?, ?, ?)", rows)
+        except (OSError, sqlite3.Error, ValueError) as error:  # a ValueError: an image of another size, or damaged
             raise self._failed(error) from error
         return torch.from_numpy(pixels).float() / 255
 

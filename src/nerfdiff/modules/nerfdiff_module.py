@@ -1,9 +1,11 @@
 """Joint training of the single-image NeRF and the CDM (paper, "Training Phase")."""
 
+import hashlib
 import math
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,14 +16,16 @@ from torch import Tensor
 
 from nerfdiff.cameras import Rays
 from nerfdiff.data.batch import ViewBatch
+from nerfdiff.diffusion.denoiser import Condition
 from nerfdiff.diffusion.schedule import add_noise, alpha_sigma, expand, v_from_x0_eps
 from nerfdiff.errors import ConfigError
 from nerfdiff.field.encoder import Encoding
 from nerfdiff.field.triplane import Triplane
-from nerfdiff.metrics.image import psnr
+from nerfdiff.metrics.image import psnr, psnr_of_mse
 from nerfdiff.model import NerfDiff
 from nerfdiff.modules.kept_renderings import KeptRenderings
 from nerfdiff.randomness import generator, spread_times
+from nerfdiff.results.environment import git_state
 
 WHOLE = {"ray_share": 1.0, "through_rendering": True}
 """The paper's joint loss, which checkpoints from before there was another have."""
@@ -63,13 +67,15 @@ class NerfDiffModule(LightningModule):
         self.save_hyperparameters(ignore=["kept_renderings"])
         self.model = NerfDiff(**model)
         self.frozen_field = losses["lambda_ic"] == 0
-        self.kept = KeptRenderings(kept_renderings) if kept_renderings else None
+        self._kept_folder, self._kept = kept_renderings, None
+        self.begun_from: str | None = None  # SHA-256 of `init`'s weights
         if self.frozen_field:
             self.model.encoder.requires_grad_(False)
             self.model.decoder.requires_grad_(False)
         if losses["lambda_dm"] == 0:
             self.model.denoiser.requires_grad_(False)
         self.image_size: list[int] | None = None  # of the training images, once one was seen
+        self.trained_before: list[dict[str, Any]] = []  # what `init` was trained on
         if channels_last:
             self.model.to(memory_format=torch.channels_last)
 
@@ -82,7 +88,7 @@ class NerfDiffModule(LightningModule):
         noise = self._noise(batch, losses)
         loss_ic, rendering = self._photometric(batch, encoding, noise, losses)
         loss = losses["lambda_ic"] * loss_ic
-        values = {"loss_ic": loss_ic, "psnr": _psnr_of_mse(loss_ic)}
+        values = {"loss_ic": loss_ic, "psnr": psnr_of_mse(loss_ic.detach())}
         if losses["lambda_dm"]:
             loss_dm = self._diffusion(batch, encoding, rendering, noise["eps"])
             loss = loss + losses["lambda_dm"] * loss_dm
@@ -145,6 +151,37 @@ class NerfDiffModule(LightningModule):
         """What a person has to keep the same to resume, or to use the model well."""
         checkpoint["accumulate_grad_batches"] = self.trainer.accumulate_grad_batches
         checkpoint["image_size"] = self.image_size
+        checkpoint["trained_on"] = self.trained_on()
+        checkpoint["begun_from"] = self.begun_from
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.trained_before = list(checkpoint.get("trained_on", [{}])[:-1])
+        self.begun_from = checkpoint.get("begun_from")
+
+    @property
+    def kept(self) -> KeptRenderings | None:
+        """The frozen field's renderings, in a folder named by the weights that render them."""
+        if self._kept is None and self._kept_folder is not None:
+            weights = hashlib.sha256()
+            for part in (self.model.encoder, self.model.decoder):
+                for value in part.state_dict().values():
+                    weights.update(value.cpu().contiguous().numpy().tobytes())
+            self._kept = KeptRenderings(Path(self._kept_folder) / weights.hexdigest()[:12])
+        return self._kept
+
+    def trained_on(self) -> list[dict[str, Any]]:
+        """What the weights have seen: one entry for each training that led here, this one last."""
+        data, losses = self.trainer.datamodule, self.hparams.losses
+        part = "field" if losses["lambda_dm"] == 0 else "CDM" if losses["lambda_ic"] == 0 else "field and the CDM"
+        seen = {
+            "part": part,
+            "images": self.trainer.global_step * data.batch_size * data.target_views,
+            "dataset": data.name,
+            "scenes": data.trained_scenes,
+            "about": data.about,
+            "git_sha": git_state(Path(__file__).parent)["git_sha"],
+        }
+        return [*self.trained_before, seen]
 
     def _photometric(
         self, batch: ViewBatch, encoding: Encoding, noise: dict[str, Tensor], losses: Mapping
@@ -211,11 +248,17 @@ class NerfDiffModule(LightningModule):
         """L^DM (paper, eq. "ddpm") on v."""
         condition = self.model.condition(encoding, batch.target_cameras, rendered)
         targets = 2 * batch.targets.flatten(0, 1) - 1
-        times = spread_times(batch.draws, self.hparams.seed).repeat_interleave(batch.target_cameras.shape[1])
+        views = batch.target_cameras.shape[1]
+        each = (batch.draws[:, None] * views + torch.arange(views, device=batch.draws.device)).flatten()
+        times = spread_times(each, self.hparams.seed)
         return self._denoising_loss(condition, targets, eps.flatten(0, 1), times)
 
     def _denoising_loss(
-        self, condition, x0: Float[Tensor, "batch 3 height width"], eps: Tensor, t: Float[Tensor, "batch"]
+        self,
+        condition: Condition,
+        x0: Float[Tensor, "batch 3 height width"],
+        eps: Float[Tensor, "batch 3 height width"],
+        t: Float[Tensor, "batch"],
     ) -> Tensor:
         alpha, sigma = (expand(c, x0) for c in alpha_sigma(t))
         predicted = self.model.denoiser.velocity(add_noise(x0, eps, alpha, sigma), t, condition)
@@ -232,8 +275,10 @@ class NerfDiffModule(LightningModule):
         if not self.frozen_field:
             noise["jitter"] = torch.stack([torch.rand(some, samples, generator=g, device=g.device) for g in generators])
         if losses["lambda_dm"]:
-            noise["eps"] = torch.stack([torch.randn(targets.shape[1:], generator=g, device=g.device) for g in generators])
-        if some < rays:
+            noise["eps"] = torch.stack(
+                [torch.randn(targets.shape[1:], generator=g, device=g.device) for g in generators]
+            )
+        if losses["ray_share"] < 1:
             noise["rays"] = torch.stack([torch.randperm(rays, generator=g, device=g.device)[:some] for g in generators])
         return noise
 
@@ -251,7 +296,3 @@ def _check_losses(losses: Mapping, kept_renderings: str | None) -> None:
         )
     if kept_renderings and ic:
         raise ConfigError("kept_renderings are of a field that does not change: set losses.lambda_ic=0, or it to null")
-
-
-def _psnr_of_mse(mse: Tensor) -> Tensor:
-    return -10 * torch.log10(mse.detach() + 1e-6)

@@ -16,6 +16,7 @@ from nerfdiff.distill.teacher import Teacher
 from nerfdiff.distill.trace import Step
 from nerfdiff.distill.virtual_views import VirtualViews
 from nerfdiff.errors import ConfigError
+from nerfdiff.metrics.image import psnr_of_mse
 from nerfdiff.randomness import generator
 from nerfdiff.results.timing import timed
 
@@ -128,6 +129,7 @@ class NGDModule(LightningModule):
         self._start = self.field.snapshot()
         self._good = self._start
         self._finite = torch.ones(len(self.field), dtype=torch.bool, device=self.device)
+        self._finite_on_host = torch.ones(len(self.field), dtype=torch.bool, pin_memory=self.device.type == "cuda")
         self._fitted = self.cameras
         if self.fit_source:
             both = zip(self.cameras, self.field.cameras, strict=True)
@@ -143,22 +145,35 @@ class NGDModule(LightningModule):
             self.cuda_graphs,
         )
 
+    def on_train_batch_start(self, step: int, batch_idx: int) -> int | None:
+        """Ends the run (-1) when every scene is lost."""
+        self._alive = self._finite_on_host.tolist()
+        return None if any(self._alive) else -1
+
     def training_step(self, step: int, batch_idx: int) -> None:
         with timed("guide"):
             rendered = self._guidance() if self.teachers[0].follows_field else None
-        per_scene = [None] * len(self.teachers) if rendered is None else rendered
-        targets = torch.stack([t.targets(step, images) for t, images in zip(self.teachers, per_scene, strict=True)])
+        targets = torch.stack(
+            [
+                teacher.targets(step, None if rendered is None else rendered[scene])
+                if self._alive[scene]
+                else self._last_targets[scene]  # the teacher of a lost scene rests
+                for scene, teacher in enumerate(self.teachers)
+            ]
+        )
         losses = self._fit(targets)
         first, last = (losses[0], losses[-1]) if len(losses) else (None, None)
         distance = first if rendered is None else _mse(rendered, targets)
-        self._records.append((self.teachers[0].t, self.teachers[0].weight, first, last, distance))
+        one = self.teachers[self._alive.index(True)]
+        self._records.append((one.t, one.weight, first, last, distance))
         self._keep_what_is_good(losses, targets)
 
     def on_train_end(self) -> None:
-        """Back to the last good field, or if it has been harmed to the one it began as.
+        """Back to the last finite field, or if it has been harmed to the one it began as.
 
         It has been if it explains the last targets worse than the one it began as (not by little: they may want what
-        a blurred field gives up), or, as they may have followed it astray, the input view much worse.
+        a blurred field gives up), or, as they may have followed it astray, the input view much worse. What was finite
+        before it failed is no exception.
         """
         self.field.restore(self._good, ~self._finite)
         harmed = torch.zeros_like(self._finite)
@@ -169,7 +184,7 @@ class NGDModule(LightningModule):
             of_targets, of_source = (
                 10 ** (dB / 10) * was + 1e-6 for dB, was in zip(self.tolerances, began, strict=True)
             )
-            harmed = ~((refined[0] <= of_targets) & (refined[1] <= of_source)) & self._finite
+            harmed = ~((refined[0] <= of_targets) & (refined[1] <= of_source))
             self.field.restore(after, ~harmed)
         for scene, (finite, worse) in enumerate(zip(self._finite.tolist(), harmed.tolist(), strict=True)):
             self.statuses[scene] = "non-finite" if not finite else "diverged" if worse else "ok"
@@ -182,14 +197,14 @@ class NGDModule(LightningModule):
             return None if values is None else float(values[scene])
 
         return [
-            Step(t, weight, number(first), number(last), None if distance is None else _psnr(number(distance)))
+            Step(t, weight, number(first), number(last), number(None if distance is None else psnr_of_mse(distance)))
             for t, weight, first, last, distance in self._records
         ]
 
     def progress(self) -> tuple[float | None, float | None]:
         """t of the last step and the mean agreement of renderings and targets, in dB. Waits for the device."""
         t, *_, distance = self._records[-1]
-        return t, None if distance is None else _psnr(float(distance.mean()))
+        return t, None if distance is None else float(psnr_of_mse(distance.nanmean()))
 
     @timed("fit")
     def _fit(self, targets: SceneImages) -> Float[Tensor, "steps scenes"]:
@@ -205,7 +220,10 @@ class NGDModule(LightningModule):
 
     def _keep_what_is_good(self, losses: Float[Tensor, "steps scenes"], targets: SceneImages) -> None:
         """Note which scenes are well, on the device: nobody waits to hear it. One that is not stays lost."""
-        self._finite &= torch.isfinite(losses).all(0) & self.field.finite()
+        self._finite &= torch.isfinite(losses).all(0) & self.field.finite() & torch.isfinite(targets).flatten(1).all(1)
+        self._finite_on_host.copy_(
+            self._finite, non_blocking=True
+        )  # read without waiting: on a GPU it may be a step old
         if self._good is self._start:
             self._last_targets = targets
         keep = self._finite.reshape(-1, 1, 1, 1, 1)
@@ -237,7 +255,3 @@ class NGDModule(LightningModule):
 
 def _mse(images: Float[Tensor, "scenes *rest"], others: Float[Tensor, "scenes *rest"]) -> Float[Tensor, "scenes"]:
     return (images - others).square().flatten(1).mean(1)
-
-
-def _psnr(mse: float) -> float:
-    return -10 * math.log10(mse + 1e-6)

@@ -53,7 +53,7 @@ Render = Callable[
 class Probe:
     """A random field and rays through it, of the sizes and types of what is to be rendered.
 
-    A field to render may show nothing (it starts out empty, where importance samples are uniform ones), or be so
+    A field to render may show nothing (importance samples are uniform ones then), or be so
     sharp that rounding shows. This one tells kernels that are wrong from those that round, whatever is rendered.
 
     Args:

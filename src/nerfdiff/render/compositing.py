@@ -3,6 +3,7 @@
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from nerfdiff.precision import at_least_single
 
@@ -16,5 +17,6 @@ def compositing_weights(
     nearly transparent samples stays at 1.
     """
     optical = at_least_single(density) * at_least_single(lengths)
-    before = optical.cumsum(-1) - optical
+    # shifted: a sum less its last term has lost what came before a much larger one
+    before = pad(optical.cumsum(-1)[..., :-1], (1, 0))
     return torch.exp(-before) * -torch.expm1(-optical)

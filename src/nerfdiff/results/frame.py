@@ -1,9 +1,9 @@
 """Result rows as pandas tables: one line per run, or one per configuration with means and intervals."""
 
-import csv
 import json
+import logging
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,10 +11,13 @@ import numpy as np
 import pandas as pd
 
 from nerfdiff.errors import DataError
+from nerfdiff.results.inside import inside
 from nerfdiff.results.intervals import Bootstrap, Estimate, spread
-from nerfdiff.results.row import ResultRow, flatten, read_rows
+from nerfdiff.results.row import ResultRow, RowFile, flatten
 from nerfdiff.results.sweep_jobs import RESULTS
-from nerfdiff.results.sweep_lines import FRECHET, PER_SCENE
+from nerfdiff.results.sweep_lines import FRECHET, PER_SCENE, read_scores
+
+log = logging.getLogger(__name__)
 
 TIMINGS = ("scene_s", "distill_s", "denoise_s", "fit_s", "guide_s", "encode_s", "render_s")
 COUNTS = ("denoiser_calls", "field_queries")  # of all scenes of a run; a table has them per scene
@@ -25,19 +28,35 @@ IDENTITY = (
     "dataset", "split_sha256", "n_scenes", "n_views", "image_size", "ckpt_sha256", "weights", "model", "field",
     "strategy", "prior", "K", "samples_per_ray", "backend", "compile", "scenes_at_once", "precision", "device", "cpu",
 )  # fmt: skip
+MEASURED = tuple(f"{name}{end}" for name in (*QUALITIES, *COSTS) for end in ("", "_low", "_high"))
+CONFIGURATION_COLUMNS = (*IDENTITY, "seeds", "failed", "fallbacks", *MEASURED, "overrides", "results")
 
 
 @dataclass(frozen=True)
 class Run:
-    """A row, and the folder of the file that it is from."""
+    """A row, the folder of the file that it is from, and the folders of results in which its own may lie."""
 
     row: ResultRow
     home: Path
+    roots: tuple[Path, ...] = ()
+
+    def file(self, *parts: str) -> Path | None:
+        """A file or folder below its folder (itself without `parts`); None if it is not there, or outside of `roots`.
+
+        Without `roots` it is to lie within `home`.
+        """
+        return (
+            None if self.row.folder is None else inside(self.roots or (self.home,), self.home, self.row.folder, *parts)
+        )
 
     @property
-    def folder(self) -> Path | None:
-        """Of its predictions and scores; None where it failed before there was one."""
-        return None if self.row.folder is None else self.home / self.row.folder
+    def astray(self) -> bool:
+        """Whether it names a folder that is there, and not within the results."""
+        return (
+            self.row.folder is not None
+            and self.file() is None
+            and inside((Path("/"),), self.home, self.row.folder) is not None
+        )
 
     @property
     def settings(self) -> tuple[str, ...]:
@@ -50,8 +69,11 @@ class Run:
         return self.row.cpu or self.row.device if self.row.device == "cpu" else self.row.device
 
 
-def find_results(path: str | Path) -> list[Path]:
+def find_results(path: str | Path, onerror: Callable[[OSError], object] | None = None) -> list[Path]:
     """The files of results at or below a path, in order.
+
+    Args:
+        onerror: is told of folders that cannot be read.
 
     Raises:
         DataError: there is no such file or folder.
@@ -62,19 +84,20 @@ def find_results(path: str | Path) -> list[Path]:
     if not path.is_dir():
         raise DataError(f"results={path} does not exist; name a folder of runs or a {RESULTS}")
     found = []
-    for folder, below, files in os.walk(path):
+    for folder, below, files in os.walk(path, onerror=onerror):
         below[:] = sorted(set(below) - {"predictions", "scores"})  # of many files, none of them results
         found += [Path(folder, RESULTS)] if RESULTS in files else []
     return found
 
 
-def read_runs(path: Path) -> list[Run]:
+def read_runs(file: Path | RowFile, roots: tuple[Path, ...] = ()) -> list[Run]:
     """The runs of one file of results, oldest first.
 
     Raises:
-        DataError: see `read_rows`.
+        DataError: see `RowFile.read`.
     """
-    return [Run(row, path.parent) for row in read_rows(path)]
+    file = file if isinstance(file, RowFile) else RowFile(file)
+    return [Run(row, file.path.parent, roots) for row in file.read()]
 
 
 def newest(runs: Sequence[Run]) -> list[Run]:
@@ -96,9 +119,14 @@ def newest(runs: Sequence[Run]) -> list[Run]:
     return list(kept.values())
 
 
+def run_lines(runs: Iterable[Run]) -> Iterator[dict[str, object]]:
+    """One line per run: `results`, the folder of its file, and all fields of its row flattened."""
+    return ({"results": str(run.home)} | flatten(run.row) for run in runs)
+
+
 def runs_frame(runs: Sequence[Run]) -> pd.DataFrame:
-    """One line per run, all fields of its row flattened, and `results`, the folder of its file."""
-    return pd.DataFrame([{"results": str(run.home)} | flatten(run.row) for run in runs])
+    """`run_lines` as a table."""
+    return pd.DataFrame(run_lines(runs))
 
 
 @dataclass(frozen=True)
@@ -132,11 +160,13 @@ class Configuration:
         return [run.row.seed for run in self.runs]
 
 
-def configurations(runs: Sequence[Run], bootstrap: Bootstrap) -> list[Configuration]:
+def configurations(
+    runs: Sequence[Run], bootstrap: Bootstrap, warn: Callable[[str], object] = log.warning
+) -> list[Configuration]:
     """The configurations of which a run succeeded, in the order of their first such run; see `newest` for what counts.
 
-    Raises:
-        DataError: a file of scores is damaged.
+    Args:
+        warn: is told of damaged files of scores, which are as good as none.
     """
     groups: dict[str, list[Run]] = {}
     failures: dict[tuple, int] = {}
@@ -150,28 +180,28 @@ def configurations(runs: Sequence[Run], bootstrap: Bootstrap) -> list[Configurat
     for members in groups.values():
         attempt, devices = _attempt(members[0]), {members[0].device, None}
         failed = sum(failures.get((attempt, device), 0) for device in devices)
-        found.append(Configuration(tuple(members), failed, _estimates(members, bootstrap)))
+        found.append(Configuration(tuple(members), failed, _estimates(members, bootstrap, warn)))
     return found
 
 
 def configurations_frame(found: Sequence[Configuration]) -> pd.DataFrame:
-    """One line per configuration: who it is, then `<name>`, `<name>_low` and `<name>_high` of each estimate."""
-    return pd.DataFrame([_line(configuration) for configuration in found])
+    """One line per configuration, see `configuration_line`."""
+    return pd.DataFrame([configuration_line(configuration) for configuration in found])
 
 
-def _line(configuration: Configuration) -> dict[str, object]:
+def configuration_line(configuration: Configuration) -> dict[str, object]:
+    """Who it is, then `<name>`, `<name>_low` and `<name>_high` of each estimate."""
     row = configuration.row
-    line: dict[str, object] = {name: getattr(row, name) for name in IDENTITY}
+    line: dict[str, object] = dict.fromkeys(CONFIGURATION_COLUMNS)
+    line |= {name: getattr(row, name) for name in IDENTITY}
     line["image_size"] = "x".join(map(str, row.image_size or ())) or None
     line |= {
         "seeds": " ".join(map(str, configuration.seeds)),
         "failed": configuration.failed,
         "fallbacks": sum(run.row.fallbacks or 0 for run in configuration.runs),
     }
-    for name in (*QUALITIES, *COSTS):
-        if name in configuration.estimates:
-            mean, low, high = configuration.estimates[name]
-            line |= {name: mean, f"{name}_low": low, f"{name}_high": high}
+    for name, (mean, low, high) in configuration.estimates.items():
+        line |= {name: mean, f"{name}_low": low, f"{name}_high": high}
     return line | {"overrides": " ".join(configuration.settings), "results": str(configuration.runs[0].home)}
 
 
@@ -185,7 +215,7 @@ def _attempt(run: Run) -> tuple:
     return run.settings, run.row.strategy
 
 
-def _estimates(runs: Sequence[Run], bootstrap: Bootstrap) -> dict[str, Estimate]:
+def _estimates(runs: Sequence[Run], bootstrap: Bootstrap, warn: Callable[[str], object]) -> dict[str, Estimate]:
     found = {}
     for name in (*QUALITIES, *COUNTS, *SIZES):
         values = [value for run in runs if (value := _value(run.row, name)) is not None]
@@ -194,12 +224,12 @@ def _estimates(runs: Sequence[Run], bootstrap: Bootstrap) -> dict[str, Estimate]
     for name in TIMINGS:
         timings = [timing for run in runs if (timing := getattr(run.row, name)) is not None]
         if len(timings) == len(runs):
-            medians, halves = [t["median"] for t in timings], [t["iqr"] / 2 for t in timings]
+            medians, halves = [float(t["median"]) for t in timings], [t["iqr"] / 2 for t in timings]
             ends = [(median - half, median + half) for median, half in zip(medians, halves, strict=True)]
             found[name] = Estimate(
                 float(np.mean(medians)), max(0.0, min(low for low, _ in ends)), max(high for _, high in ends)
             )
-    names, values = _per_scene(runs)
+    names, values = _per_scene(runs, warn)
     return found | dict(zip(names, bootstrap.over_seeds_and_scenes(values) if names else (), strict=True))
 
 
@@ -210,23 +240,22 @@ def _value(row: ResultRow, name: str) -> float | None:
     return value / row.n_scenes if name in COUNTS else float(value)
 
 
-def _per_scene(runs: Sequence[Run]) -> tuple[list[str], np.ndarray]:
+def _per_scene(runs: Sequence[Run], warn: Callable[[str], object]) -> tuple[list[str], np.ndarray]:
     """Names of metrics, and their values (metrics, seeds, scenes) where every scene of every run has one."""
-    scores = [dict(_read_scenes(run)) for run in runs]
+    scores = [_read_scenes(run, warn) for run in runs]
     scenes = sorted(set.intersection(*map(set, scores)))
     names = [name for name in PER_SCENE if scenes and all(name in seed[scene] for seed in scores for scene in scenes)]
     values = [[[seed[scene][name] for scene in scenes] for seed in scores] for name in names]
     return names, np.array(values, dtype=np.float64)
 
 
-def _read_scenes(run: Run) -> Iterator[tuple[str, dict[str, float]]]:
+def _read_scenes(run: Run, warn: Callable[[str], object]) -> dict[str, dict[str, float]]:
     """What was measured of each scene; nothing where the scores are no longer beside the results."""
-    path = run.folder and run.folder / "scores" / str(run.row.strategy) / "per_scene.csv"
-    if path is None or not path.is_file():
-        return
+    path = run.file("scores", str(run.row.strategy), "per_scene.csv")
+    if path is None:
+        return {}
     try:
-        with open(path, newline="", encoding="utf-8") as file:
-            for line in csv.DictReader(file):
-                yield line["scene"], {name: float(line[name]) for name in PER_SCENE if line.get(name)}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: cannot be read ({error}); delete it to go without intervals over scenes") from error
+        return read_scores(path)
+    except DataError as error:
+        warn(f"{error}; the means are of its row, without intervals over scenes")
+        return {}

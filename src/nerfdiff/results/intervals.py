@@ -1,7 +1,8 @@
 """How far a mean over scenes can be trusted: bootstrap intervals over the scenes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import fmean
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -46,7 +47,8 @@ class Bootstrap:
             return Estimate(mean)
         drawn = np.random.default_rng(self.seed).integers(len(values), size=(self.resamples, len(values)))
         tails = (1 - self.level) / 2
-        low, high = np.quantile(values[drawn].mean(axis=1), [tails, 1 - tails])
+        with np.errstate(invalid="ignore"):
+            low, high = np.quantile(values[drawn].mean(axis=1), [tails, 1 - tails])
         return Estimate(mean, float(low), float(high))
 
     def over_seeds_and_scenes(self, values: Float[np.ndarray, "metrics seeds scenes"]) -> list[Estimate]:
@@ -55,24 +57,40 @@ class Bootstrap:
         With one seed these are the intervals over the scenes alone.
         """
         _, seeds, scenes = values.shape
-        means = values.mean(axis=(1, 2))
+        with np.errstate(invalid="ignore"):
+            means = values.mean(axis=(1, 2))
         if seeds * scenes < 2:
             return [Estimate(float(mean)) for mean in means]
-        rng = np.random.default_rng(self.seed)  # scenes first: the same as in the draws of one seed
-        scene_shares = _shares(rng, self.resamples, scenes)
-        seed_shares = _shares(rng, self.resamples, seeds)
-        drawn = ((seed_shares @ values) * scene_shares).sum(axis=2)
+        scene_shares, seed_shares = _draws(self.seed, self.resamples, scenes, seeds)
         tails = (1 - self.level) / 2
-        low, high = np.quantile(drawn, [tails, 1 - tails], axis=1)
-        return [Estimate(*map(float, ends)) for ends in zip(means, low, high, strict=True)]
+        found = []
+        for mean, own in zip(means, values, strict=True):
+            with np.errstate(invalid="ignore"):
+                drawn = ((seed_shares @ own) * scene_shares).sum(axis=1)
+                low, high = np.quantile(drawn, [tails, 1 - tails])
+            found.append(Estimate(float(mean), float(low), float(high)))
+        return found
+
+
+@lru_cache(maxsize=4)
+def _draws(seed: int, draws: int, scenes: int, seeds: int) -> tuple[np.ndarray, np.ndarray]:
+    """The `_shares` of scenes and of seeds. Scenes first: they are the same as in the draws of one seed."""
+    rng = np.random.default_rng(seed)
+    return _shares(rng, draws, scenes), _shares(rng, draws, seeds)
 
 
 def _shares(rng: np.random.Generator, draws: int, among: int) -> Float[np.ndarray, "draws among"]:
     """How often each is among as many drawn with replacement, as a share."""
-    drawn = rng.integers(among, size=(draws, among))
-    return (drawn[..., None] == np.arange(among)).mean(axis=1)
+    drawn = rng.integers(among, size=(draws, among)) + among * np.arange(draws)[:, None]
+    return np.bincount(drawn.ravel(), minlength=draws * among).reshape(draws, among) / among
 
 
-def spread(values: list[float]) -> Estimate:
+def mean_of(values: Sequence[float]) -> float:
+    """The mean, of infinite numbers too."""
+    with np.errstate(invalid="ignore"):
+        return float(np.mean(values))
+
+
+def spread(values: Sequence[float]) -> Estimate:
     """The mean over runs and their range, where there are several."""
-    return Estimate(fmean(values), min(values), max(values)) if len(values) > 1 else Estimate(values[0])
+    return Estimate(mean_of(values), min(values), max(values)) if len(values) > 1 else Estimate(values[0])

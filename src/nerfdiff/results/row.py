@@ -6,29 +6,38 @@ One file holds many runs and only ever grows. Numbers that JSON lacks are the st
 This file imports nothing heavy, so that tools can read results without loading PyTorch.
 """
 
-import csv
 import fcntl
-import io
 import json
+import logging
 import math
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import field as has
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, get_args
 
-from nerfdiff.errors import DataError
-from nerfdiff.results.files import write_text
+from nerfdiff.errors import DataError, some
+
+log = logging.getLogger(__name__)
 
 SCHEMA_VERSION = 2
 STATUSES = ("ok", "nan", "oom", "diverged", "error", "timeout")
 NONFINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
+LARGEST = 1e100  # number, if finite
+LONGEST = 2**20  # bytes of a line
+LONGEST_ERROR = 50_000  # letters of one, of which a run that failed writes the beginning
+MANY = 1000  # overrides of a row
+TOLD = 3  # lines that are no rows, with the reason
+WORDS = 100_000  # texts that rows share in memory
+
 Timing = dict[str, float | int]
+PARTS = ("n", "median", "iqr")
 
 
-@dataclass(kw_only=True)
+@dataclass(kw_only=True, slots=True)
 class ResultRow:
     """One measured run. None means not measured or not applicable.
 
@@ -40,10 +49,11 @@ class ResultRow:
     virtual views, which the denoiser sees and is guided by) are parts of it. `timing_s` are the seconds per scene that
     measuring cost the run. `peak_mem_bytes` is what a GPU had allocated; on a CPU the process's resident set, with what
     earlier jobs of a sweep left in it. `backend` is what rendered: `triton`, `torch`, or `cpu`, which is PyTorch in the
-    order that suits a CPU. `samples_per_ray` counts coarse and fine ones. `fid_n` is the number of images on either
-    side of `fid` and `fd_st_vgg`; `n_views` counts all scored images; `consistency_n` scenes were measured for
-    consistency. `fallbacks` counts the scenes whose distillation failed and which kept an earlier field; `error` says
-    how; where all did, the status is `diverged`. The three after it are of the training run that made the checkpoint.
+    order that suits a CPU. `samples_per_ray` counts coarse and fine ones. `K` counts the virtual views that fields were
+    fitted to, the most of any scene. `fid_n` is the number of images on either side of `fid` and `fd_st_vgg`; `n_views`
+    counts all scored images; `consistency_n` scenes were measured for consistency. `fallbacks` counts the scenes whose
+    distillation failed and which kept an earlier field; `error` says how; where all did, the status is `diverged`. The
+    three after it are of the training run that made the checkpoint.
     """
 
     # identity
@@ -146,14 +156,17 @@ def encode(value: Any) -> Any:
 
 
 def append_row(path: str | Path, row: ResultRow) -> None:
-    """Add one line, safely beside other writers and whole or not at all.
+    """Add one line, safely beside other writers and whole or not at all; of a very long error the beginning.
 
     Raises:
         DataError: the file cannot be written; it is as it was before.
     """
+    path = Path(path)
+    if row.error is not None:
+        row = replace(row, error=row.error[:LONGEST_ERROR])
     line = (json.dumps(encode(asdict(row)), allow_nan=False) + "\n").encode()
     try:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
         try:
             fcntl.flock(file, fcntl.LOCK_EX)
@@ -167,73 +180,254 @@ def append_row(path: str | Path, row: ResultRow) -> None:
             except OSError:
                 os.ftruncate(file, size)
                 raise
+            if not size:
+                _keep_name(path.parent)
         finally:
             os.close(file)
     except OSError as error:
         raise DataError(f"cannot append a result to {path}: {error.strerror or error}") from error
 
 
+def _keep_name(folder: Path) -> None:
+    """A new file's name survives a power cut only when its folder is on the disk too."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@dataclass
+class Skipped:
+    """Lines of a file of results that are no rows: how many, and what is wrong with the first few.
+
+    Args:
+        torn: what is wrong with the last line, where it has no end.
+    """
+
+    path: Path
+    whole: int = 0
+    reasons: list[str] = has(default_factory=list)
+    torn: str | None = None
+
+    @property
+    def lines(self) -> int:
+        return self.whole + (self.torn is not None)
+
+    def add(self, reason: str) -> None:
+        self.whole += 1
+        if len(self.reasons) < TOLD:
+            self.reasons.append(reason)
+
+    def __str__(self) -> str:
+        what = "1 line is no row and was" if self.lines == 1 else f"{self.lines} lines are no rows and were"
+        told = [*self.reasons, *filter(None, [self.torn])]
+        more = f"; and {self.lines - len(told)} more" if self.lines > len(told) else ""
+        return f"{self.path}: {what} skipped: {'; '.join(told)}{more}"
+
+
+class RowFile:
+    """The rows of one file of results, oldest first. Lines that are no rows are skipped, counted and warned of.
+
+    Reads line by line, and what it has read it does not read again: many readings of a growing file cost as much as
+    one. Writers wait only while the end of the file is looked up; a row is seen whole or not at all.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        self._restart()
+
+    def _restart(self) -> None:
+        self.rows: list[ResultRow] = []
+        self.skipped = Skipped(self.path)
+        self._offset, self._number, self._foreign, self._warned = 0, 0, False, ""
+        self._words: dict[str, str] = {}
+
+    def read(self) -> list[ResultRow]:
+        """All rows, with those that were added since the last reading.
+
+        Raises:
+            DataError: the file is missing, cannot be read, or has rows of another schema alone.
+        """
+        try:
+            if self.path.exists() and not self.path.is_file():
+                raise DataError(f"cannot read results {self.path}: it is not a file")
+            with open(self.path, "rb") as file:
+                fcntl.flock(file, fcntl.LOCK_SH)
+                end = os.fstat(file.fileno()).st_size
+                fcntl.flock(file, fcntl.LOCK_UN)
+                if end < self._offset:  # somebody edited it
+                    self._restart()
+                file.seek(self._offset)
+                self._read(file, end)
+        except OSError as error:
+            raise DataError(f"cannot read results {self.path}: {error}") from error
+        if self._foreign and not self.rows:
+            raise DataError(str(self.skipped))
+        if self.skipped.lines and str(self.skipped) != self._warned:
+            self._warned = str(self.skipped)
+            log.warning("%s", self._warned)
+        return self.rows
+
+    def _read(self, file: IO[bytes], end: int) -> None:
+        self.skipped.torn = None  # somebody may have gone on with it
+        while self._offset < end:
+            line = file.readline(min(LONGEST, end - self._offset))
+            reason = _longer(file, line, end) if len(line) == LONGEST else None
+            whole = reason is not None or line.endswith(b"\n")
+            if reason is None and line.strip():
+                try:
+                    self.rows.append(_parse(line, self._words))
+                    whole = True
+                except RecursionError:
+                    reason = "nested too deep"
+                except ValueError as error:
+                    self._foreign |= isinstance(error, ForeignRow)
+                    reason = str(error)
+            if reason is not None and not whole:
+                self.skipped.torn = f"line {self._number + 1}: {reason}"
+                return
+            self._offset = file.tell()
+            self._number += 1
+            if reason is not None:
+                self.skipped.add(f"line {self._number}: {reason}")
+
+
+def _longer(file: IO[bytes], line: bytes, end: int) -> str | None:
+    """Skip the rest of a line that is too long."""
+    if line.endswith(b"\n"):
+        return None
+    while file.tell() < end and not line.endswith(b"\n"):
+        line = file.readline(min(LONGEST, end - file.tell()))
+    return f"longer than {LONGEST} bytes"
+
+
 def read_rows(path: str | Path) -> list[ResultRow]:
-    """All rows of a file, oldest first; writers wait meanwhile, so that none is seen half.
+    """All rows of a file, oldest first; see `RowFile`.
 
     Raises:
-        DataError: the file is missing, a line is damaged, or a row is of another schema version; the message
-            names the line.
+        DataError: see `RowFile.read`.
     """
-    try:
-        with open(path, encoding="utf-8") as file:
-            fcntl.flock(file, fcntl.LOCK_SH)
-            lines = file.read().split("\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"cannot read results {path}: {error}") from error
-    return [_parse(line, f"{path}, line {number}") for number, line in enumerate(lines, 1) if line.strip()]
+    return RowFile(path).read()
 
 
-def _parse(line: str, where: str) -> ResultRow:
+class ForeignRow(ValueError):
+    """A whole row, of another schema."""
+
+
+def _parse(line: bytes, words: dict[str, str]) -> ResultRow:
+    """A row; equal texts of rows are one object in `words`."""
     try:
-        values = json.loads(line)
+        values = json.loads(line.decode())
     except ValueError as error:
-        raise DataError(f"{where}: not JSON ({error}); remove the line to read the others") from error
-    version = values.get("schema_version") if isinstance(values, dict) else None
+        raise ValueError(f"not JSON ({error})") from error
+    if not isinstance(values, dict):
+        raise ValueError("not a JSON object")
+    version = values.get("schema_version")
     if version != SCHEMA_VERSION:
-        raise DataError(
-            f"{where}: schema version {version!r}, this program reads {SCHEMA_VERSION}; "
+        raise ForeignRow(
+            f"schema version {_shown(version)}, this program reads {SCHEMA_VERSION}; "
             "keep rows of other versions in a file of their own"
         )
-    known = {field.name: field.type for field in fields(ResultRow)}
-    if unknown := sorted(values.keys() - known.keys()):
-        raise DataError(f"{where}: unknown fields {', '.join(unknown)}; was it written by a newer program?")
-    try:
-        return ResultRow(**{key: _decode(value, known[key]) for key, value in values.items()})
-    except (TypeError, ValueError) as error:
-        raise DataError(f"{where}: {error}") from error
+    if unknown := values.keys() - KINDS.keys():
+        names = some([_shown(name) for name in unknown])
+        raise ForeignRow(f"unknown fields {names}; was it written by a newer program?")
+    if values.get("run_id") is None:
+        raise ValueError("no run_id")
+    if b"\\ud" in line or b"\\uD" in line:
+        values = {key: _writable(value) for key, value in values.items()}
+    decoded = {}
+    for key, value in values.items():
+        if value is None:
+            continue
+        name, wanted, accept = KINDS[key]
+        decoded[name] = found = accept(value)
+        if found is None:
+            raise ValueError(f"{name} is to be {wanted}, it is {_shown(value)}")
+        if len(words) < WORDS:
+            if type(found) is str:
+                decoded[name] = words.setdefault(found, found)
+            elif name == "overrides":
+                decoded[name] = [words.setdefault(word, word) for word in found]
+    if "status" in decoded and decoded["status"] not in STATUSES:
+        raise ForeignRow(f"status {_shown(decoded['status'])} is unknown; was it written by a newer program?")
+    return ResultRow(**decoded)
 
 
-def _decode(value: Any, kind: Any) -> Any:
-    """Undo `encode` in numeric fields; text fields keep their text, whatever it says."""
-    if isinstance(value, dict):
-        return {key: NONFINITE.get(item, item) for key, item in value.items()}
-    return NONFINITE.get(value, value) if kind == float | None and isinstance(value, str) else value
+def _writable(value: Any) -> Any:
+    """Text without half pairs of surrogates, which no file can hold."""
+    if isinstance(value, list):
+        return [_writable(item) for item in value]
+    return value.encode(errors="replace").decode() if isinstance(value, str) else value
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:59]}…"
+
+
+def _float(value: Any) -> float | None:
+    """Undo `encode`."""
+    if type(value) is str:
+        return NONFINITE.get(value)
+    fits = type(value) in (float, int) and not LARGEST <= abs(value) < math.inf
+    return value if fits else None
+
+
+def _count(value: Any) -> int | None:
+    return value if type(value) is int and 0 <= value < 2**63 else None
+
+
+def _timing(value: Any) -> Timing | None:
+    if type(value) is not dict or value.keys() != set(PARTS):
+        return None
+    found = {"n": _count(value["n"]), "median": _float(value["median"]), "iqr": _float(value["iqr"])}
+    return None if None in found.values() else found
+
+
+def _texts(value: Any) -> list[str] | None:
+    fits = type(value) is list and len(value) <= MANY and all(type(item) is str for item in value)
+    return value if fits else None
+
+
+def _size(value: Any) -> list[int] | None:
+    fits = type(value) is list and len(value) == 2 and all(_count(item) is not None for item in value)
+    return value if fits else None
+
+
+def _is(kind: type) -> Callable[[Any], Any]:
+    return lambda value: value if type(value) is kind else None
+
+
+ACCEPTED: dict[Any, tuple[str, Callable[[Any], Any]]] = {
+    str: ("text", _is(str)),
+    bool: ("true or false", _is(bool)),
+    int: ("a whole number, not negative", _count),
+    float: (f"a number below {LARGEST:g}", _float),
+    list[str]: (f"a list of at most {MANY} texts", _texts),
+    list[int]: ("a height and a width", _size),
+    Timing: ("a timing {n, median, iqr}", _timing),
+}
+SEED = ("a whole number", lambda value: value if type(value) is int and abs(value) < 2**63 else None)
+# by the name in a file: the field's name (the same object every time, which makes rows fast), what it holds, and what
+# gives the value of what was read, or None
+KINDS = {
+    f.name: (f.name, *(SEED if f.name == "seed" else ACCEPTED[(get_args(f.type) or (f.type,))[0]]))
+    for f in fields(ResultRow)
+}
+
+
+TIMINGS = {f.name: tuple(f"{f.name}_{part}" for part in PARTS) for f in fields(ResultRow) if f.type == Timing | None}
+COLUMNS = tuple(column for f in fields(ResultRow) for column in TIMINGS.get(f.name, (f.name,)))
 
 
 def flatten(row: ResultRow) -> dict[str, Any]:
     """One scalar per column: timings become `<name>_n`, `_median` and `_iqr`, lists words."""
     flat: dict[str, Any] = {}
-    for field in fields(row):
-        value = getattr(row, field.name)
-        if field.type == Timing | None:
-            flat |= {f"{field.name}_{part}": (value or {}).get(part) for part in ("n", "median", "iqr")}
+    for name in KINDS:
+        value = getattr(row, name)
+        if name in TIMINGS:
+            flat |= zip(TIMINGS[name], map((value or {}).get, PARTS), strict=True)
         else:
-            flat[field.name] = " ".join(map(str, value)) if isinstance(value, list) else value
+            flat[name] = " ".join(map(str, value)) if isinstance(value, list) else value
     return flat
-
-
-def write_rows_csv(path: str | Path, rows: Sequence[ResultRow]) -> None:
-    """Write rows flattened to CSV, atomically; what was not measured is an empty cell."""
-    flat = [flatten(row) for row in rows]
-    text = io.StringIO()
-    columns = list(flat[0]) if flat else [field.name for field in fields(ResultRow)]
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(flat)
-    write_text(Path(path), text.getvalue())

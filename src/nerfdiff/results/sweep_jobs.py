@@ -1,5 +1,6 @@
 """The jobs of a sweep, the rows they left, and which of them make one row of the sweep's table."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -8,8 +9,12 @@ from pathlib import Path
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
-from nerfdiff.results.row import ResultRow, read_rows
+from nerfdiff.errors import DataError
+from nerfdiff.results.inside import inside
+from nerfdiff.results.row import ResultRow, RowFile
 from nerfdiff.sweeps.plan import read_plan
+
+log = logging.getLogger(__name__)
 
 RESULTS = "results.jsonl"
 SEED = "seed"
@@ -38,15 +43,18 @@ class Job:
     def status(self) -> str:
         return NOT_RUN if self.row is None else self.row.status
 
-    @property
-    def scores(self) -> Path:
-        """Of a job that succeeded."""
-        return self.folder / self.row.folder / "scores" / self.row.strategy
+    def own(self, kind: str, *below: str) -> Path:
+        """Its predictions or scores (`kind`), or what lies `below` these.
 
-    @property
-    def predictions(self) -> Path:
-        """Of a job that succeeded."""
-        return self.folder / self.row.folder / "predictions" / self.row.strategy
+        Raises:
+            DataError: that is not there, or outside of the sweep's folder.
+        """
+        row = self.row
+        parts = (row.folder or "", kind, row.strategy or "", *below) if row is not None else ()
+        path = inside((self.folder,), self.folder, *parts) if all(parts) and parts else None
+        if path is None:
+            raise DataError(f"{self.folder.joinpath(*parts)} is not there, or outside of the sweep's folder")
+        return path
 
 
 @dataclass(frozen=True)
@@ -92,15 +100,23 @@ def planned(sweep: DictConfig) -> list[tuple[str, ...]]:
     return list(product(*choices.values()))
 
 
-def jobs_of(sweep: DictConfig) -> list[Job]:
+def results_of(sweep: DictConfig) -> RowFile:
+    """The rows of the sweep's jobs, as yet unread."""
+    return RowFile(Path(sweep.hydra.sweep.dir) / RESULTS)
+
+
+def jobs_of(sweep: DictConfig, file: RowFile | None = None) -> list[Job]:
     """Every job of the sweep with the newest row that it left in the sweep's folder.
 
+    Args:
+        file: `results_of` the sweep; it tells afterwards which lines were skipped.
+
     Raises:
-        DataError: the file of results is damaged.
+        DataError: the file of results cannot be read, or has rows of another schema alone.
     """
-    path = Path(sweep.hydra.sweep.dir) / RESULTS
-    rows = {frozenset(row.overrides or ()): row for row in (read_rows(path) if path.is_file() else ())}
-    return [Job(overrides, rows.get(frozenset(overrides)), path.parent) for overrides in planned(sweep)]
+    file = file or results_of(sweep)
+    rows = {frozenset(row.overrides or ()): row for row in (file.read() if file.path.exists() else ())}
+    return [Job(overrides, rows.get(frozenset(overrides)), file.path.parent) for overrides in planned(sweep)]
 
 
 def group(jobs: Sequence[Job], keys: Sequence[str]) -> list[Group]:
@@ -132,10 +148,18 @@ def group(jobs: Sequence[Job], keys: Sequence[str]) -> list[Group]:
 def counterpart(of: Group, groups: Sequence[Group], labels: Mapping[str, str]) -> Group | None:
     """The group that has `labels`, and else those of `of`."""
     wanted = (of.labels | dict(labels)).items()
+    if not labels:
+        return None
     found = [other for other in groups if labels.items() <= other.labels.items() <= wanted]
-    return max(found, key=lambda other: len(other.labels), default=None) if labels else None
+    return max(found, key=lambda other: len(other.labels), default=None)
 
 
 def shown_predictions(groups: Sequence[Group]) -> dict[str, Path]:
     """The folder of the first seed's predictions by the group's name, of groups that have one."""
-    return {group.name: group.succeeded[0].predictions for group in groups if group.succeeded}
+    shown = {}
+    for of in groups:
+        try:
+            shown.update((of.name, job.own("predictions")) for job in of.succeeded[:1])
+        except DataError as error:
+            log.warning("the pictures are without %s: %s", of.name, error)
+    return shown

@@ -4,20 +4,20 @@ import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 import numpy as np
 
 from nerfdiff.errors import DataError
 from nerfdiff.metrics.summary import IMAGE_METRICS, SCENE_METRICS
-from nerfdiff.results.intervals import Bootstrap, Estimate, spread
+from nerfdiff.results.intervals import Bootstrap, Estimate, mean_of, spread
 from nerfdiff.results.row import ResultRow
 from nerfdiff.results.sweep_jobs import Group, Job, Labels, counterpart
 
 FRECHET = ("fid", "fd_st_vgg")  # one number for all scenes of a run
 PER_RUN = (*FRECHET, "distill_s", "scene_s")
 PER_SCENE = (*IMAGE_METRICS, *SCENE_METRICS)
+LARGEST = 2**21  # bytes of a file of scores: of some 10,000 scenes
 
 SceneValues = dict[str, float]
 
@@ -64,13 +64,19 @@ def lines_of(
         goal: likewise, of the group at which a Fréchet distance is as low as it can get.
         paper: numbers of the paper, each beside the labels `of` the group that they are for.
 
-    Raises:
-        DataError: a file of scores is damaged.
+    A group of which a file of scores is missing or damaged has the means of its rows, and says so as its error.
     """
-    values = [over_seeds(group.succeeded) for group in groups]
+    values, lost = [], []
+    for group in groups:
+        try:
+            values.append(over_seeds(group.succeeded))
+            lost.append(None)
+        except DataError as error:
+            values.append({})
+            lost.append(f"{error}; the means are of its rows, without intervals over scenes")
     sets = [_per_run([job.row for job in group.succeeded]) for group in groups]
     lines = []
-    for group, scenes, runs in zip(groups, values, sets, strict=True):
+    for number, (group, scenes, runs) in enumerate(zip(groups, values, sets, strict=True)):
         other, aim = counterpart(group, groups, reference), counterpart(group, groups, goal)
         differences, closed = {}, {}
         if other is not None and other is not group:
@@ -84,9 +90,11 @@ def lines_of(
                 seeds=len({job.row.seed for job in group.succeeded}),
                 scenes=len(scenes.get("psnr", ())),
                 status=_status(group),
-                error=_error(group),
+                error=_error(group, lost[number]),
                 fallbacks=sum(job.row.fallbacks or 0 for job in group.succeeded),
-                metrics={metric: bootstrap(_array(by_scene)) for metric, by_scene in scenes.items()} | runs,
+                metrics={metric: bootstrap(_array(by_scene)) for metric, by_scene in scenes.items()}
+                | (_per_run([job.row for job in group.succeeded], PER_SCENE) if lost[number] else {})
+                | runs,
                 differences=differences,
                 closed=closed,
                 paper=next((_numbers(entry) for entry in paper if _same(entry["of"], group.labels)), {}),
@@ -96,37 +104,49 @@ def lines_of(
 
 
 def over_seeds(jobs: Sequence[Job]) -> dict[str, SceneValues]:
-    """The mean over seeds of each metric in each scene, of scenes where all seeds have it."""
-    read = [read_scenes(job.scores / "per_scene.csv") for job in jobs]
+    """The mean over seeds of each metric in each scene, of scenes where all seeds have it.
+
+    Raises:
+        DataError: the scores of a job are missing or damaged.
+    """
+    read = [_by_metric(read_scores(job.own("scores", "per_scene.csv"))) for job in jobs]
     values = {}
     for metric in read[0] if read else ():
         common = [scene for scene in read[0][metric] if all(scene in seed.get(metric, {}) for seed in read)]
         if common:
-            values[metric] = {scene: fmean(seed[metric][scene] for seed in read) for scene in common}
+            values[metric] = {scene: mean_of([seed[metric][scene] for seed in read]) for scene in common}
     return values
 
 
-def read_scenes(path: Path) -> dict[str, SceneValues]:
-    """What was measured of each scene, by metric.
+def read_scores(path: Path) -> dict[str, dict[str, float]]:
+    """What was measured of each scene: values by metric.
 
     Raises:
         DataError: the file is missing or damaged.
     """
-    values: dict[str, SceneValues] = {}
     try:
+        if (size := path.stat().st_size) > LARGEST or not path.is_file():
+            raise ValueError(f"{size} bytes are too many" if path.is_file() else "no file")
         with open(path, newline="", encoding="utf-8") as file:
-            for row in csv.DictReader(file):
-                for metric in PER_SCENE:
-                    if row.get(metric):
-                        values.setdefault(metric, {})[row["scene"]] = float(row[metric])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: cannot be read ({error}); delete it and run the sweep again") from error
+            return {
+                line["scene"]: {name: float(line[name]) for name in PER_SCENE if line.get(name)}
+                for line in csv.DictReader(file)
+            }
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        raise DataError(f"{path}: cannot be read ({error})") from error
+
+
+def _by_metric(scores: Mapping[str, Mapping[str, float]]) -> dict[str, SceneValues]:
+    values: dict[str, SceneValues] = {}
+    for scene, measured in scores.items():
+        for metric, value in measured.items():
+            values.setdefault(metric, {})[scene] = value
     return values
 
 
-def _per_run(rows: Sequence[ResultRow]) -> dict[str, Estimate]:
+def _per_run(rows: Sequence[ResultRow], names: Sequence[str] = PER_RUN) -> dict[str, Estimate]:
     found = {}
-    for name in PER_RUN:
+    for name in names:
         values = [getattr(row, name) for row in rows if getattr(row, name) is not None]
         if values:
             found[name] = spread([float(value["median"] if isinstance(value, dict) else value) for value in values])
@@ -163,9 +183,10 @@ def _status(group: Group) -> str:
     return words if len(group.failed) == len(group.jobs) else f"{words} ({len(group.failed)} of {len(group.jobs)} jobs)"
 
 
-def _error(group: Group) -> str | None:
+def _error(group: Group, lost: str | None) -> str | None:
     """What the jobs say, each saying once: also of scenes that fell back in jobs that succeeded."""
-    return "; ".join(dict.fromkeys(job.row.error for job in group.jobs if job.row and job.row.error)) or None
+    said = dict.fromkeys(job.row.error for job in group.jobs if job.row and job.row.error)
+    return "; ".join(filter(None, [*said, lost])) or None
 
 
 def _array(values: SceneValues) -> np.ndarray:

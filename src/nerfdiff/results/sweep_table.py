@@ -17,7 +17,7 @@ from nerfdiff.errors import UserError
 from nerfdiff.results.files import write_text
 from nerfdiff.results.intervals import Bootstrap
 from nerfdiff.results.sweep_frontier import Frontier
-from nerfdiff.results.sweep_jobs import Group, group, jobs_of
+from nerfdiff.results.sweep_jobs import Group, group, jobs_of, results_of
 from nerfdiff.results.sweep_lines import Line, lines_of
 from nerfdiff.results.sweep_text import to_csv, to_markdown, to_rich
 
@@ -71,7 +71,13 @@ class SweepTable(Callback):
             self._told(self._write)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        self._told(self._finish)
+        """Hydra lets no Exception of a callback end the command: without a table, or any success, it is an exit."""
+        try:
+            groups, lines, notes = self._write()
+        except Exception as error:
+            why = f"{'' if isinstance(error, UserError) else f'{type(error).__name__}: '}{error}"
+            raise SystemExit(f"error: this sweep's table could not be written: {why}") from error
+        self._show(groups, lines, notes)
 
     @property
     def _written(self) -> float:
@@ -92,32 +98,39 @@ class SweepTable(Callback):
         if not any(job.row for job in jobs_of(self.sweep) if set(job.overrides) == overrides):
             record_failure(config, error, None, None)
 
-    def _write(self) -> tuple[list[Group], list[Line]]:
-        groups = group(jobs_of(self.sweep), self.labels)
+    def _write(self) -> tuple[list[Group], list[Line], list[str]]:
+        file = results_of(self.sweep)
+        groups = group(jobs_of(self.sweep, file), self.labels)
         lines = lines_of(groups, self.bootstrap, self.reference, self.goal, self.paper)
         if self.frontier is not None:
             lines = self.frontier(groups, lines)
+        notes = [str(file.skipped)] if file.skipped.lines else []
         folder = Path(self.sweep.hydra.sweep.dir)
         write_text(folder / TABLE, to_csv(lines))
-        write_text(folder / "table.md", to_markdown(lines))
-        return groups, lines
+        write_text(folder / "table.md", to_markdown(lines, notes))
+        return groups, lines, notes
 
-    def _finish(self) -> None:
-        from nerfdiff.results.sweep_grid import grid
-        from nerfdiff.results.sweep_orbits import orbits
-
-        (groups, lines), folder = self._write(), Path(self.sweep.hydra.sweep.dir)
+    def _show(self, groups: Sequence[Group], lines: Sequence[Line], notes: Sequence[str]) -> None:
+        folder = Path(self.sweep.hydra.sweep.dir)
         shown = [number for number, line in enumerate(lines) if line.frontier or self.frontier is None]
         if shown:
             console = Console(width=None if sys.stdout.isatty() else 200)
-            console.print(to_rich([lines[number] for number in shown]))
+            console.print(to_rich([lines[number] for number in shown], notes))
         if not any(line.seeds for line in lines):
-            # Hydra lets no Exception of a callback end the command
             raise SystemExit(f"error: no job of this sweep succeeded; {folder / 'table.md'} says why")
-        groups = [groups[number] for number in shown]
+        try:
+            left = self._pictures(folder, [groups[number] for number in shown])
+        except Exception as error:  # of whatever reads the jobs' pictures and videos
+            log.error("the sweep's pictures: %s", error)
+            left = "none"
+        log.info("table: %s and .csv   pictures: %s", folder / "table.md", left)
+
+    def _pictures(self, folder: Path, groups: Sequence[Group]) -> str:
+        from nerfdiff.results.sweep_grid import grid
+        from nerfdiff.results.sweep_orbits import orbits
+
         pictures = [
             grid(folder / "grid.png", self.sweep, groups),
             orbits(folder / "orbits.mp4", groups, self.sweep.orbit),
         ]
-        left = ", ".join(str(picture) for picture in pictures if picture)
-        log.info("table: %s and .csv   pictures: %s", folder / "table.md", left or "none")
+        return ", ".join(str(picture) for picture in pictures if picture) or "none"

@@ -1,6 +1,5 @@
 """A sweep's lines as text: CSV with every number, Markdown, and a table for the terminal."""
 
-import csv
 import io
 from collections.abc import Sequence
 from typing import Any
@@ -13,6 +12,7 @@ from nerfdiff.results.intervals import Estimate
 from nerfdiff.results.sweep_jobs import shown
 from nerfdiff.results.sweep_lines import Line
 from nerfdiff.results.table import COLUMNS, Column
+from nerfdiff.results.text import csv_lines, markdown_cell, markdown_lines, one_line
 
 DIFFERENCES = ("psnr", "ssim", "lpips", "st_lpips_vgg")  # in tables for people; the CSV has all
 NOTE = (
@@ -37,23 +37,18 @@ def to_csv(lines: Sequence[Line]) -> str:
         flat.append(row | {"error": line.error})
     columns = list(dict.fromkeys(column for row in flat for column in row if column != "error"))
     text = io.StringIO()
-    writer = csv.DictWriter(text, [*columns, "error"], restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(flat)
+    csv_lines(text, [*columns, "error"], flat)
     return text.getvalue()
 
 
-def to_markdown(lines: Sequence[Line]) -> str:
-    """A row per line, and what its numbers are."""
+def to_markdown(lines: Sequence[Line], notes: Sequence[str] = ()) -> str:
+    """A row per line, what its numbers are, and `notes`."""
     headings, body = cells(lines)
-    rows = [headings, ["---"] * len(headings), *body]
-    table = "".join(
-        "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in row) + " |\n" for row in rows
-    )
-    return f"{table}\n{NOTE}\n"
+    told = [f"{markdown_cell(note)}\n" for note in notes]
+    return "\n".join([markdown_lines([headings, *body]), f"{NOTE}\n", *told])
 
 
-def to_rich(lines: Sequence[Line]) -> Group:
+def to_rich(lines: Sequence[Line], notes: Sequence[str] = ()) -> Group:
     """The same on its side, a terminal having more room for rows than for columns; what went wrong stands below."""
     headings, body = cells(lines)
     table = Table(show_header=False)
@@ -61,8 +56,9 @@ def to_rich(lines: Sequence[Line]) -> Group:
         table.add_column(justify="right" if column else "left", overflow="fold")
     for heading, *values in zip(headings, *body, strict=True):
         if heading != "error":
-            table.add_row(heading, *map(Text, values))  # brackets are no markup here
-    return Group(table, *(Text(f"{line.name}: {line.error}") for line in lines if line.error), Text(NOTE))
+            table.add_row(*(Text(one_line(cell)) for cell in (heading, *values)))  # brackets are no markup here
+    errors = [f"{line.name}: {line.error}" for line in lines if line.error]
+    return Group(table, *(Text(one_line(text)) for text in [*errors, NOTE, *notes]))
 
 
 def cells(lines: Sequence[Line]) -> tuple[list[str], list[list[str]]]:

@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from rich.table import Table
+from rich.text import Text
 
 from nerfdiff.results.files import write_text
 from nerfdiff.results.row import ResultRow, flatten
+from nerfdiff.results.text import markdown_lines, one_line
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ def cells(rows: Sequence[ResultRow]) -> tuple[list[str], list[list[str]]]:
 def _cell(value: Any, column: Column) -> str:
     if value is None:
         return "–"
-    return format(value * column.scale, column.format) if column.format else str(value)
+    return format(value * column.scale, column.format) if column.format else one_line(str(value))
 
 
 def rich_table(rows: Sequence[ResultRow], width: int, title: str | None = None) -> Table:
@@ -92,20 +94,20 @@ def rich_table(rows: Sequence[ResultRow], width: int, title: str | None = None) 
     notes = [", ".join(f"{heading} {value}" for heading, value in same)]
     if len(shown) < len(columns):
         notes.append("too narrow for: " + ", ".join(heading for heading, _ in columns[len(shown) :]))
-    table = Table(title=title, caption="\n".join(filter(None, notes)) or None, caption_justify="left")
+    caption = Text("\n".join(filter(None, notes)))  # names may have brackets, which are no markup
+    table = Table(title=title and Text(one_line(title)), caption=caption if caption else None, caption_justify="left")
     numeric = {c.heading for c in COLUMNS if c.format} | {"scenes", "seed", "images"}
     for heading, _, needed in shown:
         table.add_column(heading, justify="right" if heading in numeric else "left", width=needed)
     for line in zip(*(values for _, values, _ in shown), strict=True):
-        table.add_row(*line)
+        table.add_row(*map(Text, line))
     return table
 
 
 def markdown(rows: Sequence[ResultRow]) -> str:
     """A Markdown table, ending in a newline."""
     headings, body = cells(rows)
-    lines = [headings, ["---"] * len(headings), *body]
-    return "".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |\n" for line in lines)
+    return markdown_lines([headings, *body])
 
 
 def write_markdown(path: str | Path, rows: Sequence[ResultRow]) -> None:

@@ -1,11 +1,14 @@
 """What TensorBoard's tabs show beside scalars and images: hyperparameters, texts and a first screen."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams as hparams_summaries
+
+from nerfdiff.results.text import markdown_cell
 
 Layout = Mapping[str, Mapping[str, Sequence[str]]]
 """The charts of the custom scalars tab: category, then chart, then patterns of the tags that it draws."""
@@ -59,13 +62,14 @@ def overridden(words: Sequence[str], ignored: Sequence[str]) -> dict[str, str]:
 
 def table(values: Mapping[str, Any]) -> str:
     """Names and values as a Markdown table."""
-    lines = [f"| {name} | {_cell(value)} |" for name, value in values.items() if value is not None]
+    lines = [f"| {markdown_cell(name)} | {_cell(value)} |" for name, value in values.items() if value is not None]
     return "\n".join(["| | |", "|---|---|", *lines])
 
 
 def code(text: str, language: str = "") -> str:
     """Text as it is, in Markdown."""
-    return f"```{language}\n{text}\n```"
+    fence = "`" * max(3, 1 + max(map(len, re.findall("`+", text)), default=0))
+    return f"{fence}{language}\n{text}\n{fence}"
 
 
 def _plain(value: Any) -> bool | float | str:
@@ -79,4 +83,4 @@ def _plain(value: Any) -> bool | float | str:
 
 
 def _cell(value: Any) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value).replace("|", "\\|")
+    return f"{value:.6g}" if isinstance(value, float) else markdown_cell(str(value))

@@ -1,6 +1,5 @@
 """One picture that shows what a generated data set looks like."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,6 +8,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from nerfdiff.data.images import decode
+from nerfdiff.results.files import atomic
 
 
 def contact_sheet(images: Sequence[Sequence[Path]], scenes: int, views: int) -> UInt8[np.ndarray, "height width 3"]:
@@ -37,9 +37,8 @@ def write_contact_sheet(root: Path, images: Sequence[Sequence[Path]], scenes: in
     if not images:
         return None
     path = Path(root) / "contact_sheet.png"
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    Image.fromarray(contact_sheet(images, scenes, views)).save(temporary, format="PNG")
-    os.replace(temporary, path)
+    with atomic(path) as temporary:
+        Image.fromarray(contact_sheet(images, scenes, views)).save(temporary)
     return path
 
 

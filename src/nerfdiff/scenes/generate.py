@@ -43,7 +43,8 @@ def make_scenes(cfg: DictConfig | dict[str, Any]) -> dict[str, Any]:
         processes = max(1, min(process_count(cfg["processes"], variant), len(waiting)))
         console.print(
             f"{kind.category}: {len(waiting)} of {len(jobs)} scenes to render into {root.resolve()} "
-            f"({variant}, {processes} process{'es' if processes > 1 else ''})"
+            f"({variant}, {processes} process{'es' if processes > 1 else ''})",
+            markup=False,
         )
         rendered = _render(kind, waiting, processes, variant, console) if waiting else 0
         kind.finish(root)
@@ -54,9 +55,9 @@ def make_scenes(cfg: DictConfig | dict[str, Any]) -> dict[str, Any]:
     seconds, kept = time.perf_counter() - started, len(jobs) - len(waiting)
     for split, wanted in cfg["splits"].items():
         if wanted["scenes"]:
-            console.print(f"  {split}: {(root / kind.split_folder(split)).resolve()}", soft_wrap=True)
+            console.print(f"  {split}: {(root / kind.split_folder(split)).resolve()}", soft_wrap=True, markup=False)
     if sheet is not None:
-        console.print(f"  contact sheet: {sheet.resolve()}", soft_wrap=True)
+        console.print(f"  contact sheet: {sheet.resolve()}", soft_wrap=True, markup=False)
     console.print(f"  {rendered} images in {seconds:.0f} s; {kept} scenes were there already")
     sheet = None if sheet is None else str(sheet)
     return {"root": str(root), "rendered": rendered, "kept": kept, "seconds": seconds, "contact_sheet": sheet}

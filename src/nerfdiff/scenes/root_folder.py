@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.results.files import write_text
 
 MANIFEST = "scenes.json"
 
@@ -96,10 +97,4 @@ def check_manifest(root: Path, parameters: dict[str, Any]) -> None:
         wanted["views"] = known
         if wanted == found:
             return
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_suffix(f".{os.getpid()}.tmp")
-        temporary.write_text(json.dumps(wanted, indent=1, sort_keys=True) + "\n")
-        os.replace(temporary, path)
-    except OSError as error:
-        raise DataError(f"cannot write {path}: {error}; choose another root") from error
+    write_text(path, json.dumps(wanted, indent=1, sort_keys=True) + "\n")

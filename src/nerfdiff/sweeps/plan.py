@@ -23,8 +23,11 @@ def read_plan(folder: Path) -> list[tuple[str, ...]]:
     """
     path = folder / PLAN
     try:
-        return [tuple(job) for job in json.loads(path.read_text(encoding="utf-8"))["jobs"]]
+        jobs = json.loads(path.read_text(encoding="utf-8"))["jobs"]
+        if not all(isinstance(job, list) and all(isinstance(word, str) for word in job) for job in jobs):
+            raise ValueError("a job is to be a list of overrides")
+        return [tuple(job) for job in jobs]
     except FileNotFoundError:
         return []
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise DataError(f"{path}: cannot be read ({error}); delete it and run the sweep again") from error

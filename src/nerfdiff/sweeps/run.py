@@ -13,8 +13,8 @@ from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig, open_dict
 
 from nerfdiff.results.hashes import sha256_values
-from nerfdiff.results.row import ResultRow, read_rows
-from nerfdiff.results.sweep_jobs import RESULTS
+from nerfdiff.results.row import ResultRow, RowFile
+from nerfdiff.results.sweep_jobs import RESULTS, results_of
 from nerfdiff.sweeps.plan import write_plan
 from nerfdiff.sweeps.proposals import Proposals
 from nerfdiff.sweeps.space import Configuration, Space
@@ -54,12 +54,16 @@ class Run:
     deaths: int = 0
     attempted: set[Job] = field(default_factory=set)
     failures: list[str] = field(default_factory=list)
+    results: RowFile = field(init=False)
+
+    def __post_init__(self):
+        self.results = results_of(self.config)
 
     def __call__(self) -> list[JobReturn]:
         """Run what is to do, until nothing is left or the time is up.
 
         Raises:
-            DataError: the file of results is damaged, or of another schema.
+            DataError: the file of results cannot be read, or has rows of another schema alone.
             CompactHydraException: jobs failed and no callback of the sweep took note of it.
         """
         known = dict.fromkeys(self.proposals.known(self.space, self._tried()))
@@ -92,8 +96,8 @@ class Run:
 
     def _rows(self) -> dict[frozenset[str], list[ResultRow]]:
         """All rows of a job, oldest first, by its overrides."""
-        path, rows = self._folder / RESULTS, {}
-        for row in read_rows(path) if path.is_file() else ():
+        rows: dict[frozenset[str], list[ResultRow]] = {}
+        for row in self.results.read() if self.results.path.exists() else ():
             rows.setdefault(frozenset(row.overrides or ()), []).append(row)
         return rows
 

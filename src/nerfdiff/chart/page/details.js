@@ -21,8 +21,15 @@ function commandOf(run) {
 
 function picturesOf(run, small) {
   const found = [];
+  const readable = (path) => {
+    try {
+      return decodeURI(path);
+    } catch {
+      return path; // a name that is no UTF-8
+    }
+  };
   const told = (shown, what, path) => {
-    const words = `The ${what} is not where it was when this page was written: ${decodeURI(path)}`;
+    const words = `The ${what} is not where it was when this page was written: ${readable(path)}`;
     shown.onerror = () => shown.replaceWith(element("p", { className: "note" }, words));
     return shown;
   };

@@ -97,10 +97,13 @@ function bars(numbers, field, colour, at = (number) => number) {
   return { type: "data", symmetric: false, array: above, arrayminus: below, color: colour, thickness: 1.2, width: 3, visible: intervals() };
 }
 
+// Plotly takes the text of a legend for markup.
+const legendText = (name) => (name.length > 60 ? `${name.slice(0, 59)}…` : name).replaceAll("&", "&amp;").replaceAll("<", "&lt;");
+
 // Of its own, so that it is neither faint nor a ring.
 function legendEntry(colour, name) {
   const marker = { color: colour, size: 10 }, uid = uidOf("legend", name);
-  return { type: "scatter", mode: "markers", name, uid, legendgroup: name, x: [null], y: [null], marker, hoverinfo: "skip", meta: "legend" };
+  return { type: "scatter", mode: "markers", name: legendText(name), uid, legendgroup: name, x: [null], y: [null], marker, hoverinfo: "skip", meta: "legend" };
 }
 
 // What is hidden stays so by its uid, and no other group takes its place. Plotly wants one that can stand in a selector.

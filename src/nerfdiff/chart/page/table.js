@@ -50,11 +50,12 @@ function drawTable() {
 }
 
 function tableCsv() {
-  const quoted = (text) => (/[",\n]/.test(text) ? `"${String(text).replaceAll('"', '""')}"` : String(text ?? ""));
+  const inert = (text) => (typeof text === "string" && /^[=+\-@\t\r]/.test(text) ? `'${text}` : text); // as text.py does
+  const quoted = (text) => (/[",\r\n]/.test(text) ? `"${String(text).replaceAll('"', '""')}"` : String(text ?? ""));
   const ends = (column) => (column.field ? [column.field, `${column.field}_low`, `${column.field}_high`] : [column.csv]);
   const cells = (column, number) => (column.field ? [0, 1, 2].map((at) => value(number, column.field)?.[at] ?? "") : [column.text(number)]);
   const lines = table.rows({ search: "applied", order: "applied" }).data().toArray().map(([number]) => table.made.flatMap((column) => cells(column, number)));
-  return [table.made.flatMap(ends), ...lines].map((line) => line.map(quoted).join(",") + "\n").join("");
+  return [table.made.flatMap(ends), ...lines].map((line) => line.map(inert).map(quoted).join(",") + "\n").join("");
 }
 
 function saveCsv() {

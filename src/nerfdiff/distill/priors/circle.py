@@ -50,7 +50,10 @@ def plane_normal(cameras: Cameras) -> Float[Tensor, "3"]:
     centred = cameras.centres.double() - cameras.centres.double().mean(0)
     _, spread, axes = torch.linalg.svd(centred, full_matrices=True)
     if len(cameras) < 3 or spread[1] < 1e-6 * spread[0]:
-        raise DataError("prior=clevr_circle needs at least three cameras that are not in one line; use prior=sphere")
+        raise DataError(
+            "prior=clevr_circle needs at least three cameras that are not in one line (data.eval_stride above 1 leaves "
+            "some out); use prior=sphere"
+        )
     normal = axes[-1].to(cameras.c2w)
     # in the upper half-space cameras look down: their directions are against up
     return torch.where((cameras.c2w[:, :3, 2] @ normal).mean() > 0, -normal, normal)

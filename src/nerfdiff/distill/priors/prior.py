@@ -11,7 +11,10 @@ from nerfdiff.data.batch import ViewBatch
 
 @runtime_checkable
 class Prior(Protocol):
-    """Virtual cameras of a scene."""
+    """Virtual cameras of a scene.
+
+    Nothing else is read of a prior: rows record the name of its class, and as K how many cameras the scenes got.
+    """
 
     def __call__(self, scene: ViewBatch) -> Cameras:
         """Cameras [1, K] in the input camera's space, with the input's intrinsics; `scene` is a batch of one."""

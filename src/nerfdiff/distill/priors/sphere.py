@@ -27,7 +27,7 @@ class Sphere:
         source_elevation: of the input camera, in degrees.
 
     Raises:
-        ConfigError: ranges that are none.
+        ConfigError: no views, or ranges that are none.
     """
 
     views: int
@@ -36,6 +36,8 @@ class Sphere:
     source_elevation: float
 
     def __post_init__(self):
+        if self.views < 1:
+            raise ConfigError(f"prior.views={self.views} must be at least 1 (budget.views)")
         (low, high), (start, end) = self.elevation, self.azimuth
         if not -90 < low <= high < 90 or not start < end <= start + 360 or not -90 < self.source_elevation < 90:
             raise ConfigError(

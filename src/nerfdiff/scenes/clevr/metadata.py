@@ -1,7 +1,6 @@
 """Facts about each scene beside the pictures, and all of them together in `metadata.npz`."""
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerfdiff.errors import DataError
+from nerfdiff.results.files import atomic
 from nerfdiff.scenes.clevr.objects import COLOURS, MATERIALS, SHAPES, ClevrObject
 
 SLOTS = 10  # CLEVR never has more objects
@@ -49,13 +49,8 @@ def write_metadata(root: Path) -> None:
         "3d_coords": np.stack([_table(scenes, lambda o, a=axis: _place(o)[a], np.float64) for axis in range(3)], -1),
     }
     path = Path(root) / "metadata.npz"
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            np.savez(file, **arrays)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise DataError(f"cannot write {path}: {error}; free the disk or choose another root") from error
+    with atomic(path) as temporary:
+        np.savez(temporary, **arrays)
 
 
 def _place(facts: dict[str, Any]) -> tuple[float, float, float]:

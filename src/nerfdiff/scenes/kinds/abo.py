@@ -21,6 +21,7 @@ from jaxtyping import Float, UInt
 from PIL import Image
 
 from nerfdiff.errors import ConfigError
+from nerfdiff.results.files import publish
 from nerfdiff.scenes.colour import rgba
 from nerfdiff.scenes.kinds.kind import SceneJob, check_splits, check_styles, stream
 from nerfdiff.scenes.mesh import Model
@@ -137,7 +138,7 @@ class ABOScenes:
             (partial / "transforms.json").write_text(json.dumps(transforms(folder.name, c2w), indent=4))
             facts = {"category": self.category, "index": job.index, "seed": self.seed, "style": model.style}
             (partial / "scene.json").write_text(json.dumps(facts, indent=1, sort_keys=True) + "\n")
-            partial.rename(folder)
+            publish(partial, folder)
 
 
 def transforms(item: str, c2w: Float[np.ndarray, "views 4 4"]) -> dict[str, Any]:

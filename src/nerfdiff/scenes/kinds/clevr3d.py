@@ -19,6 +19,7 @@ from jaxtyping import Float, UInt16
 from PIL import Image
 
 from nerfdiff.errors import ConfigError
+from nerfdiff.results.files import settle
 from nerfdiff.scenes.clevr.metadata import SLOTS, facts_path, scene_facts, write_metadata
 from nerfdiff.scenes.clevr.objects import place_objects
 from nerfdiff.scenes.clevr.world import LAMPS, ClevrWorld
@@ -152,6 +153,7 @@ class Clevr3DScenes:
                     Image.fromarray(image).save(partial / target.name)
             targets[partial / facts.name] = facts
             (partial / facts.name).write_text(json.dumps(scene_facts(world.objects, centres)) + "\n")
+            settle(partial)
             for source, target in targets.items():
                 target.parent.mkdir(parents=True, exist_ok=True)
                 os.replace(source, target)

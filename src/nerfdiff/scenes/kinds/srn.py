@@ -22,6 +22,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from nerfdiff.errors import ConfigError
+from nerfdiff.results.files import publish
 from nerfdiff.scenes.car_proportions import STYLES as CAR_STYLES
 from nerfdiff.scenes.cars import build_car
 from nerfdiff.scenes.chairs import STYLES as CHAIR_STYLES
@@ -122,7 +123,7 @@ class SRNScenes:
             (partial / "intrinsics.txt").write_text(intrinsics_text(self.film.height))
             (partial / "scene.json").write_text(json.dumps(facts, indent=1, sort_keys=True) + "\n")
             folder.parent.mkdir(parents=True, exist_ok=True)
-            partial.rename(folder)
+            publish(partial, folder)
 
 
 def intrinsics_text(resolution: int) -> str:

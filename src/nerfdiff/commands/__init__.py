@@ -1,0 +1,1 @@
+"""The commands: in a checkout `python src/train.py …`, installed `nerfdiff-train …`."""

@@ -48,7 +48,8 @@ def test_rich_and_markdown_show_the_same(tmp_path):
 @pytest.mark.parametrize("rows", [1, 2])
 def test_names_with_brackets_are_no_markup(rows):
     found = [
-        ResultRow(run_id=str(n), strategy="s[bold]", dataset="x[/bold]/test", weights="\x1b[2Jw") for n in range(rows)
+        ResultRow(run_id=str(n), strategy="s[bold]" + "y" * 40, dataset="x[/bold]/test", weights="\x1b[2Jw")
+        for n in range(rows)
     ]
     console = Console(file=io.StringIO(), width=120)
     console.print(rich_table(found, 120, title="of x[/bold]"))

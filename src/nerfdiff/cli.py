@@ -7,6 +7,7 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from itertools import pairwise
 
 import hydra
@@ -42,6 +43,7 @@ EITHER: dict[str, tuple[type, ...]] = {
     "image_size": (int, list),  # one side of a square, or [height, width]
     "crop": (int, list),
     "checkpointing": (bool, list, str),  # everywhere or nowhere, at some resolutions, or auto
+    "devices": (int, list),
 }
 OPTIONAL_GROUPS = ("logger", "experiment", "sweep")
 MULTIRUN = ("-m", "--multirun")
@@ -148,7 +150,7 @@ def explain(error: BaseException, cfg: DictConfig | None = None) -> str | None:
         if isinstance(link, MissingMandatoryValue):
             return f"{link.full_key} must be given: add {link.full_key}=<value>"
     if isinstance(error, OmegaConfBaseException):
-        return f"{error.full_key}: {str(error).splitlines()[0]}"
+        return (f"{error.full_key}: " if error.full_key else "") + str(error).splitlines()[0]
     inner = [link for link in chain if isinstance(link, InstantiationException)][-1]
     target, *details = str(inner).splitlines()
     key = next((line for line in details if line.startswith("full_key: ")), "").removeprefix("full_key: ")
@@ -333,6 +335,10 @@ def _check_value(config: DictConfig, override: Override) -> None:
                 OmegaConf.create({"value": None if raw._is_missing() else raw._value()}), resolve=False
             )["value"]
         )
+    if isinstance(node, str) and "${" in node:  # a number that is another key's is a number as well
+        with suppress(OmegaConfBaseException, ValueError):
+            resolved = OmegaConf.select(config, override.key_or_group)
+            node = resolved if isinstance(resolved, int | float) else node
     if not override.is_hydra_override():  # Hydra checks its own, and lets some be of several kinds
         _check_kind(node, override)
 
@@ -341,11 +347,16 @@ def _check_kind(default: object, override: Override) -> None:
     """A number stays a number and a list a list; null, strings and interpolations say nothing of their kind."""
     value = override.value()
     interpolated = isinstance(value, str) and "${" in value
-    if not isinstance(value, str):
+    if not override.is_sweep_override() and "${" not in str(value):
         check_limit(override.key_or_group, value)
+    of_several = EITHER.get(override.key_or_group.rpartition(".")[2], ())
+    if isinstance(default, str) and "${" not in default and isinstance(value, (list, dict)):
+        if not isinstance(value, of_several):
+            raise ConfigError(f"{override.key_or_group} takes text (default {default}), got {_shown(value)}")
+        return
     if type(default) not in KINDS or value is None or interpolated or override.is_sweep_override():
         return
-    if isinstance(value, EITHER.get(override.key_or_group.rpartition(".")[2], ())):
+    if isinstance(value, of_several):
         return
     name, allowed = KINDS[type(default)]
     if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):

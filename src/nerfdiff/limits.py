@@ -63,7 +63,8 @@ LIMITS: dict[str, tuple[float, float, str]] = {
     "strategy.rays": AT_LEAST_1,
     "strategy.steps": AT_LEAST_1,
     "strategy.teacher.steps": AT_LEAST_1,
-    "strategy.lr_*": AT_LEAST_0,
+    "strategy.lr_planes": AT_LEAST_0,
+    "strategy.lr_decoder": AT_LEAST_0,
     "strategy.*tolerance": AT_LEAST_0,
     "strategy.*deep.every": AT_LEAST_1,
     "prior.views": AT_LEAST_1,
@@ -74,6 +75,22 @@ LIMITS: dict[str, tuple[float, float, str]] = {
     "minutes": (math.nextafter(0, 1), math.inf, "more than 0, or null"),
     "progress_every": ABOVE_0,
     "processes": AT_LEAST_1,
+    "metrics.psnr_floor": ABOVE_0,
+    "metrics.opacity_threshold": SHARE,
+    "metrics.min_size": AT_LEAST_1,
+    "metrics.batch": AT_LEAST_1,
+    "metrics.geometry.floater_*": AT_LEAST_1,
+    "metrics.geometry.hull_margin": AT_LEAST_0,
+    "metrics.geometry.depth_tails": (0, math.nextafter(0.5, 0), "from 0 to less than 0.5"),
+    "metrics.*.seed": (0, 2**32 - 1, "from 0 to 2^32 - 1"),
+    "metrics.consistency.scenes": AT_LEAST_0,
+    "metrics.consistency.lr": ABOVE_0,
+    "metrics.consistency.initial_std": AT_LEAST_0,
+    **{f"metrics.consistency.{key}": AT_LEAST_1 for key in ("views", "steps", "rays", "channels", "hidden")},
+    "metrics.consistency.plane_size": (2, 2**12, "from 2 to 4096"),
+    "metrics.consistency.importance_samples": AT_LEAST_0,
+    "sample.*": AT_LEAST_1,
+    "listed": AT_LEAST_0,
     "sheet.scenes": AT_LEAST_0,
     "sheet.views": AT_LEAST_1,
     "orbit.frames": AT_LEAST_0,
@@ -101,14 +118,15 @@ def check_limit(key: str, value: Any) -> None:
     Raises:
         ConfigError: see `check_limits`.
     """
+    low, high, words = next((LIMITS[like] for like in LIMITS if fnmatchcase(key, like)), (-math.inf, math.inf, ""))
     for number in value if isinstance(value, list) else [value]:
-        if isinstance(number, bool) or not isinstance(number, int | float):
-            continue
-        if not math.isfinite(number):
-            raise ConfigError(f"{key}={value} must be a finite number")
-        low, high, words = next((LIMITS[like] for like in LIMITS if fnmatchcase(key, like)), (-math.inf, math.inf, ""))
-        if not low <= number <= high:
-            raise ConfigError(f"{key}={value} must be {words}")
+        if isinstance(number, int | float) and not isinstance(number, bool):
+            if not math.isfinite(number):
+                raise ConfigError(f"{key}={value} must be a finite number")
+            if not low <= number <= high:
+                raise ConfigError(f"{key}={value} must be {words}")
+        elif words and number is not None and number != "auto":
+            raise ConfigError(f"{key}={value} must be a number, {words}")
 
 
 def _values(config: DictConfig, prefix: str = "") -> Iterator[tuple[str, Any, bool]]:

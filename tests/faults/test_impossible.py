@@ -12,6 +12,7 @@ import pytest
 import torch
 import yaml
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from PIL import Image
 
 from fault_fixtures import *  # noqa: F403
@@ -72,6 +73,9 @@ from training_fixtures import evaluation_overrides, overrides, run_training
         ("evaluate", "threads=-2"),
         ("evaluate", "sheet.views=0"),
         ("evaluate", "mean_image_scenes=0"),
+        ("evaluate", "metrics.geometry.depth_tails=-1"),
+        ("evaluate", "threads=text"),
+        ("train", "model.render.background=nan"),
         ("inspect_data", "seed=-1"),
     ],
 )
@@ -89,6 +93,25 @@ def defaults():
     known = {name: [] for name in ("train", "inspect_data", "export", "make_scenes", "chart", "demo")}
     known |= {"distill": ["ckpt=demo"], "evaluate": ["ckpt=demo"]}
     return {command: load_config(command, words) for command, words in known.items()}
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("compile=[]", r"compile takes text \(default none\), got \[\]"),
+        ("compile={}", "compile takes text"),
+        ("model.render.background=text", "model.render.background takes int or float"),
+        ("trainer.max_steps='${nothing}'", "Interpolation key 'nothing' not found"),
+    ],
+)
+def test_values_of_another_kind_are_refused(word, said):
+    with pytest.raises((ConfigError, OmegaConfBaseException)) as error:
+        OmegaConf.resolve(load_config("train", [word]).trainer)
+    assert re.match(said, explain(error.value))
+
+
+def test_several_devices_can_be_named():
+    assert load_config("train", ["trainer.devices=[0,1]"]).trainer.devices == [0, 1]
 
 
 @pytest.mark.parametrize("words", [["seed=-1"], ["-m", "seed=0,-1"], ["experiment=overfit", "seed=-1"]])

@@ -347,8 +347,12 @@ def _check_kind(default: object, override: Override) -> None:
     """A number stays a number and a list a list; null, strings and interpolations say nothing of their kind."""
     value = override.value()
     interpolated = isinstance(value, str) and "${" in value
+    _check_type(default, override, value, interpolated)
     if not override.is_sweep_override() and "${" not in str(value):
         check_limit(override.key_or_group, value)
+
+
+def _check_type(default: object, override: Override, value: object, interpolated: bool) -> None:
     of_several = EITHER.get(override.key_or_group.rpartition(".")[2], ())
     if isinstance(default, str) and "${" not in default and isinstance(value, (list, dict)):
         if not isinstance(value, of_several):

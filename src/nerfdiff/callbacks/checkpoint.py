@@ -90,7 +90,7 @@ class LastCheckpoint(SoundCheckpoint):
         self._due |= step % self._every_n_train_steps == 0
         asked = _most(trainer, self._signum)
         # The last step too; once `fit` ends, the EMA callback has put its average where the raw weights were.
-        if asked or step == trainer.max_steps:
+        if asked or step == trainer.max_steps or trainer.should_stop:
             self._save_if_sound(trainer)
         elif self._due and not self._should_skip_saving_checkpoint(trainer):
             self._save_checkpoint(trainer, self.format_checkpoint_name({}))

@@ -5,7 +5,7 @@ import sys
 import time
 
 from lightning import LightningModule, Trainer
-from lightning.pytorch.callbacks import ProgressBar
+from lightning.pytorch.callbacks import ProgressBar, Timer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -49,7 +49,8 @@ class TrainingProgress(ProgressBar):
                 self._said, self._said_at = step, now
         elif step - self._said >= self.every_steps or now - self._said_at >= self.every_seconds:
             rate = (step - self._first) / (now - self._began)
-            left = duration((trainer.max_steps - step) / rate)
+            seconds, timer = (trainer.max_steps - step) / rate, timer_of(trainer)
+            left = duration(seconds if timer is None else max(0.0, min(seconds, timer.time_remaining())))
             log.info("step %d of %d, %s, %.3g steps/s, %s left", step, trainer.max_steps, _words(trainer), rate, left)
             self._said, self._said_at = step, now
 
@@ -76,3 +77,14 @@ def duration(seconds: float) -> str:
     """A time as a person says it."""
     hours, minutes = divmod(round(seconds / 60), 60)
     return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min" if minutes else f"{seconds:.0f} s"
+
+
+def timer_of(trainer: Trainer) -> Timer | None:
+    """What ends the training at `trainer.max_time`; None without such a limit."""
+    return next((callback for callback in trainer.callbacks if isinstance(callback, Timer)), None)
+
+
+def share_of_time(timer: Timer) -> float:
+    """Share of the limit that has passed, over all sessions of the run."""
+    passed = timer.time_elapsed()
+    return passed / (passed + timer.time_remaining())

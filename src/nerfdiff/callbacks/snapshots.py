@@ -62,8 +62,12 @@ class Snapshots(Callback):
         for length, exponent in self.exponents.items():
             # eq. 127: θ̂_t = β_t θ̂_{t-1} + (1 - β_t) θ_t with β_t = (1 - 1/t)^(γ+1)
             torch._foreach_lerp_(self.averages[length], current, 1 - (1 - 1 / step) ** (exponent + 1))
-        if trainer.is_global_zero and (step % self.every_n_steps == 0 or step == trainer.max_steps):
+        if trainer.is_global_zero and step % self.every_n_steps == 0:
             self._save(step, pl_module)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.is_global_zero and self._seen and self._seen % self.every_n_steps:
+            self._save(self._seen, pl_module)
 
     def _save(self, step: int, pl_module: LightningModule) -> None:
         names = [name.removeprefix("model.") for name, _ in pl_module.named_parameters()]

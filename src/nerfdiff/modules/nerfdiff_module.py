@@ -14,6 +14,7 @@ from jaxtyping import Float
 from lightning import LightningModule
 from torch import Tensor
 
+from nerfdiff.callbacks.progress import share_of_time, timer_of
 from nerfdiff.cameras import Rays
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.diffusion.denoiser import Condition
@@ -41,7 +42,7 @@ class NerfDiffModule(LightningModule):
             many of a target's rays, drawn anew at every step. `through_rendering`: the gradient of L^DM flows back
             through the rendering into the field (paper).
         optimizer: AdamW's `lr`, `weight_decay`, `betas`; `warmup_steps` of linear warm-up; `decay` is `none` or
-            `cosine`, to zero at the end of training.
+            `cosine`, to zero at the end of training: at `max_steps`, or at `max_time` where that is sooner.
         validation_times: times t at which the denoising loss is measured on held-out views.
         channels_last: memory layout of the U-Nets.
         seed: of all noise; see `nerfdiff.randomness`.
@@ -127,12 +128,13 @@ class NerfDiffModule(LightningModule):
             raise ConfigError(f"optimizer.decay must be none or cosine, got {decay!r}")
         options["betas"] = tuple(options["betas"])
         trained = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
-        optimizer = torch.optim.AdamW(trained, **options)
-        total = self.trainer.max_steps
+        optimizer = torch.optim.AdamW(trained, **options, fused=self.device.type == "cuda")
+        total, timer = self.trainer.max_steps, timer_of(self.trainer)
 
         def factor(step: int) -> float:
             rise = min(1.0, (step + 1) / max(1, warmup))
-            fall = 0.5 * (1 + math.cos(math.pi * min(1.0, step / total))) if decay == "cosine" else 1.0
+            done = max(step / total, 0.0 if timer is None else share_of_time(timer))
+            fall = 0.5 * (1 + math.cos(math.pi * min(1.0, done))) if decay == "cosine" else 1.0
             return rise * fall
 
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)

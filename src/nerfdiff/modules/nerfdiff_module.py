@@ -13,6 +13,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from lightning import LightningModule
 from torch import Tensor
+from torch.nn.utils import clip_grad_norm_
+from torch.optim import Optimizer
 
 from nerfdiff.callbacks.progress import share_of_time, timer_of
 from nerfdiff.cameras import Rays
@@ -139,6 +141,14 @@ class NerfDiffModule(LightningModule):
 
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def configure_gradient_clipping(
+        self, optimizer: Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
+    ) -> None:
+        """By norm. Lightning's own refuses fused optimizers under autocast, which matters for fp16's scaler alone."""
+        if gradient_clip_val:
+            parameters = [p for group in optimizer.param_groups for p in group["params"]]
+            clip_grad_norm_(parameters, gradient_clip_val, foreach=True)
 
     def on_train_start(self) -> None:
         """A resumed run follows the settings it is given, where Lightning has just restored the old ones."""

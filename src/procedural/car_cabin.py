@@ -3,9 +3,9 @@
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.scenes.car_proportions import Proportions
-from nerfdiff.scenes.mesh import Part, both_sides, loft, panel
-from nerfdiff.scenes.paint import CarPaint, window_colour
+from procedural.car_proportions import Proportions
+from procedural.mesh import Part, both_sides, loft, panel
+from procedural.paint import CarPaint, window_colour
 
 
 class Cabin:

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from nerfdiff.scenes.car_proportions import Proportions
-from nerfdiff.scenes.mesh import Colour, Part, both_sides, box, tube
-from nerfdiff.scenes.paint import CHROME, DARK_TRIM, CarPaint
+from procedural.car_proportions import Proportions
+from procedural.mesh import Colour, Part, both_sides, box, tube
+from procedural.paint import CHROME, DARK_TRIM, CarPaint
 
 HEADLIGHT: Colour = (0.93, 0.94, 0.88)
 TAIL_LIGHT: Colour = (0.82, 0.03, 0.05)

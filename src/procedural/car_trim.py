@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from nerfdiff.scenes.car_cabin import Cabin
-from nerfdiff.scenes.car_proportions import Proportions
-from nerfdiff.scenes.mesh import Colour, Part, both_sides, box, panel
-from nerfdiff.scenes.paint import CHROME, DARK_TRIM, CarPaint
+from procedural.car_cabin import Cabin
+from procedural.car_proportions import Proportions
+from procedural.mesh import Colour, Part, both_sides, box, panel
+from procedural.paint import CHROME, DARK_TRIM, CarPaint
 
 UNDERBODY: Colour = (0.10, 0.10, 0.105)
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from nerfdiff.scenes.car_proportions import Proportions
-from nerfdiff.scenes.mesh import Colour, Part, both_sides, panel, tube
-from nerfdiff.scenes.paint import CHROME
+from procedural.car_proportions import Proportions
+from procedural.mesh import Colour, Part, both_sides, panel, tube
+from procedural.paint import CHROME
 
 TYRE: Colour = (0.07, 0.07, 0.075)
 

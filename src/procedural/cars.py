@@ -8,12 +8,12 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.scenes import car_ends, car_trim
-from nerfdiff.scenes.car_cabin import cabin
-from nerfdiff.scenes.car_proportions import Proportions, draw_proportions
-from nerfdiff.scenes.car_wheels import wheels
-from nerfdiff.scenes.mesh import Colour, Model, Part, loft
-from nerfdiff.scenes.paint import car_paint, pick
+from procedural import car_ends, car_trim
+from procedural.car_cabin import cabin
+from procedural.car_proportions import Proportions, draw_proportions
+from procedural.car_wheels import wheels
+from procedural.mesh import Colour, Model, Part, loft
+from procedural.paint import car_paint, pick
 
 
 def _arch(p: Proportions, axle: float, steps: int = 11) -> list[tuple[float, float]]:

@@ -9,8 +9,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from nerfdiff.scenes.mesh import Colour, Numbers, Part, Point, box, slab, tube
-from nerfdiff.scenes.paint import jitter, pick
+from procedural.mesh import Colour, Numbers, Part, Point, box, slab, tube
+from procedural.paint import jitter, pick
 
 WOODS: dict[str, tuple[int, Colour]] = {
     "beech": (4, (0.80, 0.64, 0.44)),

@@ -4,9 +4,9 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from nerfdiff.scenes import chairs_modern, chairs_wooden
-from nerfdiff.scenes.mesh import Model, Part
-from nerfdiff.scenes.paint import pick
+from procedural import chairs_modern, chairs_wooden
+from procedural.mesh import Model, Part
+from procedural.paint import pick
 
 STYLES: dict[str, Callable[[np.random.Generator], list[Part]]] = {
     "dining": chairs_wooden.dining,

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.scenes.chair_parts import (
+from procedural.chair_parts import (
     FABRICS,
     METALS,
     WOODS,
@@ -17,7 +17,7 @@ from nerfdiff.scenes.chair_parts import (
     smooth_path,
     star_base,
 )
-from nerfdiff.scenes.mesh import Colour, Part, box, tube
+from procedural.mesh import Colour, Part, box, tube
 
 
 def _leaning_cushion(

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nerfdiff.scenes.chair_parts import (
+from procedural.chair_parts import (
     FABRICS,
     METALS,
     WOODS,
@@ -15,7 +15,7 @@ from nerfdiff.scenes.chair_parts import (
     sheet,
     stretchers,
 )
-from nerfdiff.scenes.mesh import Colour, Part, box, loft, tube
+from procedural.mesh import Colour, Part, box, loft, tube
 
 
 def dining(rng: np.random.Generator) -> list[Part]:

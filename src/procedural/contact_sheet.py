@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from nerfdiff.data.images import decode
-from nerfdiff.results.files import atomic
+from nerfdiff.data.formats.images import decode
+from nerfdiff.utils.files import atomic
 
 
 def contact_sheet(images: Sequence[Sequence[Path]], scenes: int, views: int) -> UInt8[np.ndarray, "height width 3"]:

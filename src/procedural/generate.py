@@ -9,13 +9,13 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from nerfdiff.errors import ConfigError
-from nerfdiff.scenes.contact_sheet import write_contact_sheet
-from nerfdiff.scenes.kinds.choose import scene_kind
-from nerfdiff.scenes.kinds.kind import SceneJob, SceneKind
-from nerfdiff.scenes.mitsuba_renderer import resolve_variant
-from nerfdiff.scenes.pool import process_count, render_all
-from nerfdiff.scenes.root_folder import check_manifest, exclusive
+from nerfdiff.utils.errors import ConfigError
+from procedural.contact_sheet import write_contact_sheet
+from procedural.kinds.choose import scene_kind
+from procedural.kinds.kind import SceneJob, SceneKind
+from procedural.mitsuba_renderer import resolve_variant
+from procedural.pool import process_count, render_all
+from procedural.root_folder import check_manifest, exclusive
 
 # Raised whenever a change of the code changes the files of a given seed.
 GENERATOR_VERSION = 2

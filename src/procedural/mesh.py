@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int, Real
 
-from nerfdiff.scenes.texture import Colour, Texture
+from procedural.texture import Colour, Texture
 
 Point = Sequence[int | float] | Real[np.ndarray, "3"]
 Numbers = Sequence[int | float] | Real[np.ndarray, "numbers"]

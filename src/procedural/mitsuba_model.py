@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from nerfdiff.scenes.colour import srgb_to_linear
-from nerfdiff.scenes.mesh import Colour, Model, Part
-from nerfdiff.scenes.texture import box_coordinates
+from procedural.colour import srgb_to_linear
+from procedural.mesh import Colour, Model, Part
+from procedural.texture import box_coordinates
 
 
 @dataclass(frozen=True)

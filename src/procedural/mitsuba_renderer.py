@@ -8,8 +8,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from nerfdiff.errors import ConfigError
-from nerfdiff.scenes.colour import linear_to_srgb8
+from nerfdiff.utils.errors import ConfigError
+from procedural.colour import linear_to_srgb8
 
 
 @dataclass(frozen=True)

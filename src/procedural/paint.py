@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerfdiff.scenes.mesh import Colour
+from procedural.mesh import Colour
 
 # Shares roughly as seen on real roads, the rarer bright colours raised so that they are learnt as well.
 CAR_COLOURS: dict[str, tuple[int, Colour]] = {

@@ -9,9 +9,9 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
 
-from nerfdiff.errors import DataError
-from nerfdiff.scenes.kinds.kind import SceneJob, SceneKind
-from nerfdiff.scenes.mitsuba_renderer import MitsubaRenderer
+from nerfdiff.utils.errors import DataError
+from procedural.kinds.kind import SceneJob, SceneKind
+from procedural.mitsuba_renderer import MitsubaRenderer
 
 _worker: tuple[SceneKind, MitsubaRenderer] | None = None
 

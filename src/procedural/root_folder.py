@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from nerfdiff.errors import ConfigError, DataError
-from nerfdiff.results.files import write_text
+from nerfdiff.utils.errors import ConfigError, DataError
+from nerfdiff.utils.files import write_text
 
 MANIFEST = "scenes.json"
 

@@ -13,7 +13,7 @@ from PIL import Image
 from chart_fixtures import FRONTIERS, KNOWN, chart, failed, result, timing, write_results, write_sheet
 from nerfdiff.chart.build import build_chart
 from nerfdiff.cli import load_config
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.utils.errors import ConfigError, DataError
 
 
 def content(page: Path) -> dict:

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from nerfdiff.diffusion.ddim import ddim_step
+from nerfdiff.diffusion.sampler import ddim_step
 from nerfdiff.diffusion.schedule import alpha_sigma
 
 

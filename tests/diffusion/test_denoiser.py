@@ -3,7 +3,7 @@ import torch
 
 from model_fixtures import config, input_cameras, look_at, model
 from nerfdiff.cameras import Cameras
-from nerfdiff.errors import ConfigError
+from nerfdiff.utils.errors import ConfigError
 
 HALF = torch.full((2,), 0.5)  # t of two views
 VARIANTS = {

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from nerfdiff.diffusion.preconditioning import gaussian_velocity
+from nerfdiff.diffusion.denoiser import gaussian_velocity
 from nerfdiff.diffusion.schedule import add_noise, alpha_sigma, v_from_x0_eps
 
 

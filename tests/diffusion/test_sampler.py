@@ -8,19 +8,19 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from nerfdiff.diffusion.ddim import ddim_step
 from nerfdiff.diffusion.sampler import (
     DDIM,
     SAMPLERS,
     SPACINGS,
     DPMSolverPP2M,
     Sampler,
+    ddim_step,
     make_sampler,
     sample,
     time_steps,
 )
 from nerfdiff.diffusion.schedule import alpha_sigma
-from nerfdiff.errors import ConfigError
+from nerfdiff.utils.errors import ConfigError
 
 MEAN, STD = 0.7, 0.3
 PAIR, WIDTH = 0.6, 0.2

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from nerfdiff.diffusion.schedule import alpha_sigma, eps_from_x0
-from nerfdiff.distill.guidance import Guidance
-from nerfdiff.errors import ConfigError
+from nerfdiff.distill.ngd import Guidance
+from nerfdiff.utils.errors import ConfigError
 
 
 def images(seed: int):

@@ -21,16 +21,16 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from nerfdiff.cli import load_config
 from nerfdiff.distill.distillation import Distillation
-from nerfdiff.distill.field_file import FIELD, load_field
-from nerfdiff.distill.priors.sphere import Sphere
-from nerfdiff.errors import ConfigError, DataError, TimeUp
+from nerfdiff.distill.module import NGDModule
+from nerfdiff.distill.priors import Sphere
 from nerfdiff.evaluation.distill import _warn_of_inert, distill
 from nerfdiff.evaluation.subject import dataset_subject, picture_subject
+from nerfdiff.fit.saved_field import FIELD, load_field
 from nerfdiff.metrics.predictions import read_prediction
 from nerfdiff.metrics.score import Scorer
-from nerfdiff.modules.ngd_module import NGDModule
 from nerfdiff.results.row import read_rows
 from nerfdiff.stopping import Stopped, on_signals, stop
+from nerfdiff.utils.errors import ConfigError, DataError, TimeUp
 from training_fixtures import SRC, environment, evaluation_overrides, train_to_evaluate, write_dataset
 
 STEPS = 3

@@ -9,10 +9,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from nerfdiff.checkpoint import export, load_model
 from nerfdiff.cli import load_config
 from nerfdiff.distill.none import SingleImageNeRF
-from nerfdiff.errors import CheckpointError, ConfigError, DataError
 from nerfdiff.evaluation.evaluate import evaluate
 from nerfdiff.metrics.predictions import NonFinitePrediction
 from nerfdiff.results.row import read_rows
+from nerfdiff.utils.errors import CheckpointError, ConfigError, DataError
 from training_fixtures import evaluation_overrides, train_to_evaluate, write_dataset
 
 

@@ -9,11 +9,11 @@ import torch.nn.functional as F
 
 from model_fixtures import input_cameras, look_at
 from nerfdiff.cameras import Cameras, Rays
-from nerfdiff.distill.inner_steps import InnerSteps
-from nerfdiff.distill.ray_batches import RayBatches
-from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.triplane import Triplane
+from nerfdiff.fit.inner_steps import InnerSteps
+from nerfdiff.fit.ray_batches import RayBatches
+from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.render.renderer import Renderer
 
 RENDERER = Renderer(4, 3, 1.0, 4096)

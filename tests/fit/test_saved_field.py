@@ -7,10 +7,10 @@ from safetensors.torch import save_file
 from fault_fixtures import flip
 from model_fixtures import input_cameras, look_at, model
 from nerfdiff.cameras import Cameras
-from nerfdiff.distill.field_file import FIELD, SavedField, load_field, save_field
-from nerfdiff.distill.refined_field import RefinedField
-from nerfdiff.errors import DataError
-from nerfdiff.results.files import write_text
+from nerfdiff.fit.refined_field import RefinedField
+from nerfdiff.fit.saved_field import FIELD, SavedField, load_field, save_field
+from nerfdiff.utils.errors import DataError
+from nerfdiff.utils.files import write_text
 
 
 @pytest.fixture(scope="module")

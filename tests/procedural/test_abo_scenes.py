@@ -8,11 +8,11 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from PIL import Image
 
-from nerfdiff.errors import ConfigError
-from nerfdiff.scenes.generate import make_scenes
-from nerfdiff.scenes.kinds.abo import directions, item_id
-from nerfdiff.scenes.kinds.choose import scene_kind
-from nerfdiff.scenes.kinds.kind import SceneJob
+from nerfdiff.utils.errors import ConfigError
+from procedural.generate import make_scenes
+from procedural.kinds.abo import directions, item_id
+from procedural.kinds.choose import scene_kind
+from procedural.kinds.kind import SceneJob
 
 CONF = Path(__file__).parents[2] / "conf"
 SIZE = 32

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
-
-from nerfdiff.scenes.car_proportions import STYLES
-from nerfdiff.scenes.cars import build_car
 from scenes.closed_surface import assert_closed
+
+from procedural.car_proportions import STYLES
+from procedural.cars import build_car
 
 
 def cars(style, count=8):

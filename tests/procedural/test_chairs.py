@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
-
-from nerfdiff.scenes.chairs import STYLES, build_chair
 from scenes.closed_surface import assert_closed
+
+from procedural.chairs import STYLES, build_chair
 
 
 def chairs(style, count=12):

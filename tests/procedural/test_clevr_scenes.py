@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 from PIL import Image
-
-from nerfdiff.errors import ConfigError
-from nerfdiff.scenes.clevr.objects import COLOURS, place_objects
-from nerfdiff.scenes.clevr.world import rounded_cylinder
-from nerfdiff.scenes.generate import make_scenes
-from nerfdiff.scenes.mesh import Part
 from scenes.closed_surface import assert_closed
+
+from nerfdiff.utils.errors import ConfigError
+from procedural.clevr.objects import COLOURS, place_objects
+from procedural.clevr.world import rounded_cylinder
+from procedural.generate import make_scenes
+from procedural.mesh import Part
 
 CONF = Path(__file__).parents[2] / "conf"
 HEIGHT, WIDTH = 36, 48

@@ -8,10 +8,10 @@ import pytest
 from hydra import compose, initialize_config_dir
 from PIL import Image
 
-from nerfdiff.data.srn import SRNReader
-from nerfdiff.errors import ConfigError, DataError
-from nerfdiff.scenes.generate import make_scenes
-from nerfdiff.scenes.poses import srn_spiral
+from nerfdiff.data.readers.srn import SRNReader
+from nerfdiff.utils.errors import ConfigError, DataError
+from procedural.generate import make_scenes
+from procedural.poses import srn_spiral
 
 CONF = Path(__file__).parents[2] / "conf"
 

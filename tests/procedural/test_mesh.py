@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
-
-from nerfdiff.scenes import mesh
 from scenes.closed_surface import assert_closed
+
+from procedural import mesh
 
 GREY = (0.5, 0.5, 0.5)
 

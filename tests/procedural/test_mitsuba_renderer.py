@@ -5,14 +5,14 @@ import pytest
 import torch
 
 from nerfdiff.cameras import Cameras
-from nerfdiff.errors import ConfigError
-from nerfdiff.scenes.cars import build_car
-from nerfdiff.scenes.colour import linear_to_srgb8, rgba, srgb_to_linear
-from nerfdiff.scenes.mesh import Model, box
-from nerfdiff.scenes.mitsuba_model import ModelWorld
-from nerfdiff.scenes.mitsuba_renderer import Film, MitsubaRenderer, resolve_variant, robust_mean
-from nerfdiff.scenes.poses import look_at_origin, random_sphere
-from nerfdiff.scenes.texture import Texture
+from nerfdiff.utils.errors import ConfigError
+from procedural.cars import build_car
+from procedural.colour import linear_to_srgb8, rgba, srgb_to_linear
+from procedural.mesh import Model, box
+from procedural.mitsuba_model import ModelWorld
+from procedural.mitsuba_renderer import Film, MitsubaRenderer, resolve_variant, robust_mean
+from procedural.poses import look_at_origin, random_sphere
+from procedural.texture import Texture
 
 SIZE = 48
 HALF = np.array([0.30, 0.20, 0.10])

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
-
-from nerfdiff.scenes.products.catalogue import STYLES, build_product
-from nerfdiff.scenes.texture import PATTERNS, SIDE, Texture, box_coordinates
 from scenes.closed_surface import assert_closed
+
+from procedural.products.catalogue import STYLES, build_product
+from procedural.texture import PATTERNS, SIDE, Texture, box_coordinates
 
 
 def products(style, count=10):

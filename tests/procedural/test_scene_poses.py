@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from nerfdiff.scenes.kinds.srn import intrinsics_text, pose_text
-from nerfdiff.scenes.poses import look_at, look_at_origin, random_sphere, srn_spiral
+from procedural.kinds.srn import intrinsics_text, pose_text
+from procedural.poses import look_at, look_at_origin, random_sphere, srn_spiral
 
 # Pose files 0, 1, 64, 100 and 250 of a test car rendered on the spiral of SRN-ShapeNet.
 # fmt: off

@@ -11,9 +11,9 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from nerfdiff.cli import load_config
-from nerfdiff.scenes.generate import make_scenes
-from nerfdiff.scenes.kinds.choose import scene_kind
-from nerfdiff.scenes.kinds.kind import SceneJob
+from procedural.generate import make_scenes
+from procedural.kinds.choose import scene_kind
+from procedural.kinds.kind import SceneJob
 
 CONF = Path(__file__).parents[2] / "conf"
 SMALL = {"abo": {"splits.items.scenes": 3, "splits.items.views": 6}, "clevr3d": {"splits.scenes.scenes": 2}}

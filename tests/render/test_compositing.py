@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from nerfdiff.render.compositing import compositing_weights
+from nerfdiff.render.sampling import compositing_weights
 
 
 def naive_weights(density, lengths):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from nerfdiff.chart.frontier import frontier
+from nerfdiff.results.frontier import frontier
 
 
 def dominated(one, points) -> bool:

@@ -11,9 +11,9 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from nerfdiff.cli import CONF, check_overrides
-from nerfdiff.errors import ConfigError
 from nerfdiff.results.row import read_rows
-from nerfdiff.results.sweep_jobs import group, jobs_of
+from nerfdiff.sweeps.jobs import group, jobs_of
+from nerfdiff.utils.errors import ConfigError
 from training_fixtures import SRC, environment, run_training, write_dataset
 
 SWEEPS = sorted(path.stem for path in (CONF / "sweep").glob("*.yaml") if path.stem != "speed_accuracy")
@@ -100,7 +100,7 @@ def test_a_job_that_fails_does_not_end_those_after_it(tmp_path):
     script = tmp_path / "command.py"
     script.write_text(
         "from nerfdiff.cli import entry_point\n"
-        "from nerfdiff.errors import DataError\n"
+        "from nerfdiff.utils.errors import DataError\n"
         "@entry_point('inspect_data')\n"
         "def main(cfg):\n"
         "    if cfg.data.eval_stride == 1:\n"

@@ -12,18 +12,20 @@ from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from nerfdiff.errors import ConfigError, DataError
 from nerfdiff.evaluation import measure
 from nerfdiff.metrics.predictions import FORMAT
-from nerfdiff.results import sweep_grid, sweep_orbits, sweep_table
-from nerfdiff.results.hashes import sha256_values
 from nerfdiff.results.intervals import Bootstrap
 from nerfdiff.results.row import ResultRow, append_row, read_rows
-from nerfdiff.results.sweep_frontier import Frontier
-from nerfdiff.results.sweep_jobs import Job, counterpart, group, jobs_of, planned
-from nerfdiff.results.sweep_lines import lines_of, read_scores
-from nerfdiff.results.sweep_table import SweepTable
-from nerfdiff.results.sweep_text import to_csv, to_markdown, to_rich
+from nerfdiff.sweeps import grid as sweep_grid
+from nerfdiff.sweeps import orbits as sweep_orbits
+from nerfdiff.sweeps import table as sweep_table
+from nerfdiff.sweeps.frontier import Frontier
+from nerfdiff.sweeps.jobs import Job, counterpart, group, jobs_of, planned
+from nerfdiff.sweeps.lines import lines_of, read_scores
+from nerfdiff.sweeps.table import SweepTable
+from nerfdiff.sweeps.text import to_csv, to_markdown, to_rich
+from nerfdiff.utils.errors import ConfigError, DataError
+from nerfdiff.utils.hashes import sha256_values
 
 BOOTSTRAP = Bootstrap(resamples=200, level=0.95, seed=0)
 METRICS = {"psnr_floor": 1e-6}

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from model_fixtures import config
-from nerfdiff import memory
-from nerfdiff.errors import ConfigError
-from nerfdiff.memory import HEADROOM, PeakMemory, TrainingMemory, is_tight, training_memory, within_memory
 from nerfdiff.model import build_on_meta
+from nerfdiff.training.memory import HEADROOM, PeakMemory, TrainingMemory, is_tight, training_memory, within_memory
+from nerfdiff.training.run import memory
+from nerfdiff.utils.errors import ConfigError
 
 
 @pytest.mark.parametrize("device", ["cpu", "meta"])

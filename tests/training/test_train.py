@@ -12,7 +12,7 @@ from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import api_pb2, metadata
 
 from nerfdiff.checkpoint import load_model
-from nerfdiff.errors import CheckpointError, ConfigError, DataError
+from nerfdiff.utils.errors import CheckpointError, ConfigError, DataError
 from training_fixtures import (
     assert_same_state,
     command,
@@ -133,7 +133,7 @@ def test_accumulated_batches_give_the_gradients_of_one(data, tmp_path, whole):
 def test_two_processes_train_what_one_does_also_when_they_are_stopped(data, tmp_path, whole):
     """The scheduler's signal reaches the first of them, which has them all stop after the same step."""
     more = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "trainer.precision=32-true"]
-    progress = "{_target_: nerfdiff.callbacks.progress.TrainingProgress, every_steps: 1, every_seconds: 60}"
+    progress = "{_target_: nerfdiff.training.callbacks.progress.TrainingProgress, every_steps: 1, every_seconds: 60}"
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": environment()}
     process = subprocess.Popen(command(data, tmp_path, *more, f"callbacks.progress={progress}"), **pipes)
     for line in process.stdout:

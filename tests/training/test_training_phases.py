@@ -9,12 +9,12 @@ import torch.nn.functional as F
 from safetensors.torch import save_file
 
 from model_fixtures import config
-from nerfdiff.callbacks.snapshots import average_of
 from nerfdiff.checkpoint import export, load_model
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.errors import CheckpointError, ConfigError
-from nerfdiff.modules.kept_renderings import KeptRenderings
-from nerfdiff.modules.nerfdiff_module import NerfDiffModule
+from nerfdiff.training.callbacks.snapshots import average_of
+from nerfdiff.training.kept_renderings import KeptRenderings
+from nerfdiff.training.module import NerfDiffModule
+from nerfdiff.utils.errors import CheckpointError, ConfigError
 from training_fixtures import last_checkpoint, run_training, write_dataset
 
 OPTIMIZER = {"lr": 1e-3, "weight_decay": 0.0, "betas": [0.9, 0.99], "warmup_steps": 0, "decay": "none"}
@@ -37,7 +37,7 @@ def data(tmp_path_factory):
 @pytest.fixture(scope="module")
 def batch(data) -> ViewBatch:
     from nerfdiff.data.draws import Draws
-    from nerfdiff.data.srn import SRNReader
+    from nerfdiff.data.readers.srn import SRNReader
     from nerfdiff.data.views import TrainingViews
 
     reader = SRNReader(root=data, split="train", image_size=[8, 8], category="cars", near=0.8, far=1.8)
@@ -215,7 +215,7 @@ def test_a_run_goes_on_with_what_it_began_with(data, tmp_path):
 
 
 def test_averages_are_of_the_model_they_are_exported_with(data, tmp_path):
-    settings = "{_target_: nerfdiff.callbacks.snapshots.Snapshots, folder: %s, every_n_steps: 1, lengths: [0.05, 0.1]}"
+    settings = "{_target_: nerfdiff.training.callbacks.snapshots.Snapshots, folder: %s, every_n_steps: 1, lengths: [0.05, 0.1]}"
     run = tmp_path / "run"
     run_training(data, run, f"callbacks.snapshots={settings % (run / 'snapshots')}")
     export(run, "ema", tmp_path / "out", "float32", None, average=0.1)

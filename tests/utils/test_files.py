@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from nerfdiff.errors import BusyError, DataError
-from nerfdiff.results import files
-from nerfdiff.results.files import atomic, held, publish, write_text
+from nerfdiff.utils import files
+from nerfdiff.utils.errors import BusyError, DataError
+from nerfdiff.utils.files import atomic, held, publish, write_text
 
 
 @pytest.fixture

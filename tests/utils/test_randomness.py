@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from nerfdiff.randomness import generator, seed_of, spread_times
+from nerfdiff.utils.randomness import generator, seed_of, spread_times
 
 
 def test_seeds_depend_on_every_part_and_nothing_else():

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from nerfdiff.results import timing
-from nerfdiff.results.timing import PartClock, Stopwatch, cost_of_a_piece, summarise, timed
+from nerfdiff.utils import timing
+from nerfdiff.utils.timing import PartClock, Stopwatch, cost_of_a_piece, summarise, timed
 
 
 def test_summary_is_count_median_and_interquartile_range():

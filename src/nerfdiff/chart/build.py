@@ -18,7 +18,6 @@ from nerfdiff.chart.pictures import SmallSheets
 from nerfdiff.chart.png import write_png
 from nerfdiff.chart.published import published_for
 from nerfdiff.cli import command_words
-from nerfdiff.errors import ConfigError, DataError
 from nerfdiff.results.frame import (
     CONFIGURATION_COLUMNS,
     RESULTS,
@@ -31,6 +30,7 @@ from nerfdiff.results.frame import (
 )
 from nerfdiff.results.row import COLUMNS, RowFile
 from nerfdiff.results.text import one_line, write_csv
+from nerfdiff.utils.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from nerfdiff.chart.panels import Panel
-from nerfdiff.errors import ConfigError
+from nerfdiff.utils.errors import ConfigError
 
 NOT_METRICS = ("method", "dataset", "image_size", "source")
 SPEEDS = ("encode_s", "render_s")

@@ -9,16 +9,16 @@ from lightning import LightningModule
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras
-from nerfdiff.distill.inner_steps import InnerSteps
-from nerfdiff.distill.ray_batches import RayBatches
-from nerfdiff.distill.refined_field import RefinedField, choose
 from nerfdiff.distill.teacher import Teacher
 from nerfdiff.distill.trace import Step
 from nerfdiff.distill.virtual_views import VirtualViews
-from nerfdiff.errors import ConfigError
+from nerfdiff.fit.inner_steps import InnerSteps
+from nerfdiff.fit.ray_batches import RayBatches
+from nerfdiff.fit.refined_field import RefinedField, choose
 from nerfdiff.metrics.image import psnr_of_mse
-from nerfdiff.randomness import generator
-from nerfdiff.results.timing import timed
+from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.randomness import generator
+from nerfdiff.utils.timing import timed
 
 DECAYS = {
     "none": lambda done: 1.0,

@@ -8,11 +8,11 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfdiff.distill.ray_batches import RayBatches
-from nerfdiff.distill.refined_field import RefinedField
-from nerfdiff.errors import OutOfMemory, size_text
-from nerfdiff.memory import free_memory
+from nerfdiff.fit.ray_batches import RayBatches
+from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.render.renderer import Renderer
+from nerfdiff.training.memory import free_memory
+from nerfdiff.utils.errors import OutOfMemory, size_text
 
 log = logging.getLogger(__name__)
 

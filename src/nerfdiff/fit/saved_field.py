@@ -11,12 +11,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from nerfdiff.cameras import Cameras
-from nerfdiff.distill.refined_field import RefinedField
-from nerfdiff.errors import DataError
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.triplane import Triplane
+from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.render.renderer import Renderer
-from nerfdiff.results.files import atomic
+from nerfdiff.utils.errors import DataError
+from nerfdiff.utils.files import atomic
 
 FIELD = "field.safetensors"
 FORMAT = 1

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
 
-from nerfdiff.results.files import atomic
+from nerfdiff.utils.files import atomic
 
 IMAGE_METRICS = (
     "psnr",

@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any, get_args
 
-from nerfdiff.errors import DataError, some
+from nerfdiff.utils.errors import DataError, some
 
 log = logging.getLogger(__name__)
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nerfdiff.chart.frontier import frontier
-from nerfdiff.errors import ConfigError
-from nerfdiff.results.sweep_jobs import Group
-from nerfdiff.results.sweep_lines import Line
+from nerfdiff.results.frontier import frontier
+from nerfdiff.sweeps.jobs import Group
+from nerfdiff.sweeps.lines import Line
+from nerfdiff.utils.errors import ConfigError
 
 SIGNS = {"higher": 1.0, "lower": -1.0}
 

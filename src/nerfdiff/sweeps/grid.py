@@ -8,11 +8,11 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from nerfdiff.errors import UserError
 from nerfdiff.metrics.predictions import Prediction, read_plan, read_prediction
 from nerfdiff.metrics.score import Truth, truth_from
 from nerfdiff.results.pictures import contact_sheet
-from nerfdiff.results.sweep_jobs import Group, shown_predictions
+from nerfdiff.sweeps.jobs import Group, shown_predictions
+from nerfdiff.utils.errors import UserError
 
 log = logging.getLogger(__name__)
 

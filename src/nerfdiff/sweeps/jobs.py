@@ -9,10 +9,10 @@ from pathlib import Path
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
-from nerfdiff.errors import DataError
 from nerfdiff.results.inside import inside
 from nerfdiff.results.row import ResultRow, RowFile
 from nerfdiff.sweeps.plan import read_plan
+from nerfdiff.utils.errors import DataError
 
 log = logging.getLogger(__name__)
 

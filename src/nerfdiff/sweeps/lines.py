@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from nerfdiff.errors import DataError
 from nerfdiff.metrics.summary import IMAGE_METRICS, SCENE_METRICS
 from nerfdiff.results.intervals import Bootstrap, Estimate, mean_of, spread
 from nerfdiff.results.row import ResultRow
-from nerfdiff.results.sweep_jobs import Group, Job, Labels, counterpart
+from nerfdiff.sweeps.jobs import Group, Job, Labels, counterpart
+from nerfdiff.utils.errors import DataError
 
 FRECHET = ("fid", "fd_st_vgg")  # one number for all scenes of a run
 PER_RUN = (*FRECHET, "distill_s", "scene_s")

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from nerfdiff.evaluation.predict import ORBIT
 from nerfdiff.metrics.predictions import read_plan
 from nerfdiff.results.pictures import INK, PAPER, orbit_video
-from nerfdiff.results.sweep_jobs import Group, shown_predictions
+from nerfdiff.sweeps.jobs import Group, shown_predictions
 
 HEADING = 24
 """Pixels above each column for its name."""

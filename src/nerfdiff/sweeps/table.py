@@ -13,13 +13,13 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 from rich.console import Console
 
-from nerfdiff.errors import UserError
-from nerfdiff.results.files import write_text
 from nerfdiff.results.intervals import Bootstrap
-from nerfdiff.results.sweep_frontier import Frontier
-from nerfdiff.results.sweep_jobs import Group, group, jobs_of, results_of
-from nerfdiff.results.sweep_lines import Line, lines_of
-from nerfdiff.results.sweep_text import to_csv, to_markdown, to_rich
+from nerfdiff.sweeps.frontier import Frontier
+from nerfdiff.sweeps.jobs import Group, group, jobs_of, results_of
+from nerfdiff.sweeps.lines import Line, lines_of
+from nerfdiff.sweeps.text import to_csv, to_markdown, to_rich
+from nerfdiff.utils.errors import UserError
+from nerfdiff.utils.files import write_text
 
 log = logging.getLogger(__name__)
 
@@ -126,8 +126,8 @@ class SweepTable(Callback):
         log.info("table: %s and .csv   pictures: %s", folder / "table.md", left)
 
     def _pictures(self, folder: Path, groups: Sequence[Group]) -> str:
-        from nerfdiff.results.sweep_grid import grid
-        from nerfdiff.results.sweep_orbits import orbits
+        from nerfdiff.sweeps.grid import grid
+        from nerfdiff.sweeps.orbits import orbits
 
         pictures = [
             grid(folder / "grid.png", self.sweep, groups),

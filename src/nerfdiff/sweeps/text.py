@@ -9,10 +9,10 @@ from rich.table import Table
 from rich.text import Text
 
 from nerfdiff.results.intervals import Estimate
-from nerfdiff.results.sweep_jobs import shown
-from nerfdiff.results.sweep_lines import Line
 from nerfdiff.results.table import COLUMNS, Column
 from nerfdiff.results.text import csv_lines, markdown_cell, markdown_lines, one_line
+from nerfdiff.sweeps.jobs import shown
+from nerfdiff.sweeps.lines import Line
 
 DIFFERENCES = ("psnr", "ssim", "lpips", "st_lpips_vgg")  # in tables for people; the CSV has all
 NOTE = (

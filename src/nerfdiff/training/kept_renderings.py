@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfdiff.errors import CheckpointError
+from nerfdiff.utils.errors import CheckpointError
 
 SCHEMA = "CREATE TABLE IF NOT EXISTS checked (name TEXT PRIMARY KEY, pixels BLOB, crc INTEGER) WITHOUT ROWID"
 

@@ -15,8 +15,8 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.diffusion.unet import AUTO
-from nerfdiff.errors import ConfigError
 from nerfdiff.model import NerfDiff, build_on_meta
+from nerfdiff.utils.errors import ConfigError
 
 log = logging.getLogger(__name__)
 

@@ -18,14 +18,14 @@ from nerfdiff.cameras import Rays
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.diffusion.denoiser import Condition
 from nerfdiff.diffusion.schedule import add_noise, alpha_sigma, expand, v_from_x0_eps
-from nerfdiff.errors import ConfigError
 from nerfdiff.field.encoder import Encoding
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.metrics.image import psnr, psnr_of_mse
 from nerfdiff.model import NerfDiff
-from nerfdiff.modules.kept_renderings import KeptRenderings
-from nerfdiff.randomness import generator, spread_times
 from nerfdiff.results.environment import git_state
+from nerfdiff.training.kept_renderings import KeptRenderings
+from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.randomness import generator, spread_times
 
 WHOLE = {"ray_share": 1.0, "through_rendering": True}
 """The paper's joint loss, which checkpoints from before there was another have."""
@@ -44,7 +44,7 @@ class NerfDiffModule(LightningModule):
             `cosine`, to zero at the end of training.
         validation_times: times t at which the denoising loss is measured on held-out views.
         channels_last: memory layout of the U-Nets.
-        seed: of all noise; see `nerfdiff.randomness`.
+        seed: of all noise; see `nerfdiff.utils.randomness`.
         kept_renderings: folder where a frozen field's renderings are kept, instead of being made at every step.
 
     Raises:

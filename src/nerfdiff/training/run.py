@@ -13,8 +13,6 @@ from hydra.utils import instantiate
 from lightning import Trainer, seed_everything
 from omegaconf import DictConfig, OmegaConf
 
-from nerfdiff.callbacks.checkpoint import ClearCheckpointIO
-from nerfdiff.callbacks.record import Record
 from nerfdiff.checkpoint import (
     DAMAGED,
     check_finite,
@@ -31,14 +29,16 @@ from nerfdiff.compilation import compile_unets
 from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.diffusion.layout import channels_last
 from nerfdiff.diffusion.unet import AUTO
-from nerfdiff.errors import CheckpointError, ConfigError, ProcessLost, TrainingDiverged
 from nerfdiff.inputs import LAST, find_weights
-from nerfdiff.memory import WEIGHTS_ADAM_EMA, is_tight, within_memory
-from nerfdiff.modules.nerfdiff_module import NerfDiffModule
 from nerfdiff.processes import lost_process, watch
-from nerfdiff.results.files import held, remove_leftovers
-from nerfdiff.results.hashes import sha256_file, sha256_values
 from nerfdiff.stopping import Stopped
+from nerfdiff.training.callbacks.checkpoint import ClearCheckpointIO
+from nerfdiff.training.callbacks.record import Record
+from nerfdiff.training.memory import WEIGHTS_ADAM_EMA, is_tight, within_memory
+from nerfdiff.training.module import NerfDiffModule
+from nerfdiff.utils.errors import CheckpointError, ConfigError, ProcessLost, TrainingDiverged
+from nerfdiff.utils.files import held, remove_leftovers
+from nerfdiff.utils.hashes import sha256_file, sha256_values
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +57,7 @@ def train(cfg: DictConfig) -> dict[str, float]:
     """
     watch()
     # Seeds the initial weights, and dropout where a model has it. All other randomness is a function of cfg.seed and
-    # the draw (nerfdiff.randomness), which a resumed run takes up where it was.
+    # the draw (nerfdiff.utils.randomness), which a resumed run takes up where it was.
     seed_everything(cfg.seed, verbose=False)
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)

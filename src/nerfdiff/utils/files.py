@@ -12,7 +12,7 @@ from pathlib import Path
 import filelock
 import psutil
 
-from nerfdiff.errors import BusyError, DataError
+from nerfdiff.utils.errors import BusyError, DataError
 
 
 @contextmanager

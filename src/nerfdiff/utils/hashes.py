@@ -7,7 +7,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from nerfdiff.errors import DataError
+from nerfdiff.utils.errors import DataError
 
 
 def sha256_values(values: Any) -> str:

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.errors import DataError
-from nerfdiff.results.files import atomic
-from nerfdiff.scenes.clevr.objects import COLOURS, MATERIALS, SHAPES, ClevrObject
+from nerfdiff.utils.errors import DataError
+from nerfdiff.utils.files import atomic
+from procedural.clevr.objects import COLOURS, MATERIALS, SHAPES, ClevrObject
 
 SLOTS = 10  # CLEVR never has more objects
 

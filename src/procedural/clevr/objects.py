@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from nerfdiff.errors import ConfigError
-from nerfdiff.scenes.mesh import Colour
+from nerfdiff.utils.errors import ConfigError
+from procedural.mesh import Colour
 
 SHAPES = ("cube", "sphere", "cylinder")
 SIZES = {"small": 0.35, "large": 0.7}

@@ -20,16 +20,16 @@ import numpy as np
 from jaxtyping import Float, UInt
 from PIL import Image
 
-from nerfdiff.errors import ConfigError
-from nerfdiff.results.files import publish
-from nerfdiff.scenes.colour import rgba
-from nerfdiff.scenes.kinds.kind import SceneJob, check_splits, check_styles, stream
-from nerfdiff.scenes.mesh import Model
-from nerfdiff.scenes.mitsuba_model import ModelWorld
-from nerfdiff.scenes.mitsuba_renderer import Film, MitsubaRenderer
-from nerfdiff.scenes.poses import look_at
-from nerfdiff.scenes.products.catalogue import STYLES, build_product
-from nerfdiff.scenes.root_folder import half_written
+from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.files import publish
+from procedural.colour import rgba
+from procedural.kinds.kind import SceneJob, check_splits, check_styles, stream
+from procedural.mesh import Model
+from procedural.mitsuba_model import ModelWorld
+from procedural.mitsuba_renderer import Film, MitsubaRenderer
+from procedural.poses import look_at
+from procedural.products.catalogue import STYLES, build_product
+from procedural.root_folder import half_written
 
 VIEWS = 30
 FOV = 40.0

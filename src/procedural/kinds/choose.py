@@ -3,11 +3,11 @@
 from collections.abc import Mapping
 from typing import Any
 
-from nerfdiff.errors import ConfigError
-from nerfdiff.scenes.kinds.abo import ABOScenes
-from nerfdiff.scenes.kinds.clevr3d import Clevr3DScenes
-from nerfdiff.scenes.kinds.kind import SceneKind
-from nerfdiff.scenes.kinds.srn import SRNScenes
+from nerfdiff.utils.errors import ConfigError
+from procedural.kinds.abo import ABOScenes
+from procedural.kinds.clevr3d import Clevr3DScenes
+from procedural.kinds.kind import SceneKind
+from procedural.kinds.srn import SRNScenes
 
 KINDS = {"cars": SRNScenes, "chairs": SRNScenes, "abo": ABOScenes, "clevr3d": Clevr3DScenes}
 

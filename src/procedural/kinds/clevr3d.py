@@ -18,16 +18,16 @@ import numpy as np
 from jaxtyping import Float, UInt16
 from PIL import Image
 
-from nerfdiff.errors import ConfigError
-from nerfdiff.results.files import settle
-from nerfdiff.scenes.clevr.metadata import SLOTS, facts_path, scene_facts, write_metadata
-from nerfdiff.scenes.clevr.objects import place_objects
-from nerfdiff.scenes.clevr.world import LAMPS, ClevrWorld
-from nerfdiff.scenes.colour import linear_to_srgb8
-from nerfdiff.scenes.kinds.kind import SceneJob, ascending, check_splits, stream
-from nerfdiff.scenes.mitsuba_renderer import Film, MitsubaRenderer
-from nerfdiff.scenes.poses import look_at_origin
-from nerfdiff.scenes.root_folder import half_written
+from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.files import settle
+from procedural.clevr.metadata import SLOTS, facts_path, scene_facts, write_metadata
+from procedural.clevr.objects import place_objects
+from procedural.clevr.world import LAMPS, ClevrWorld
+from procedural.colour import linear_to_srgb8
+from procedural.kinds.kind import SceneJob, ascending, check_splits, stream
+from procedural.mitsuba_renderer import Film, MitsubaRenderer
+from procedural.poses import look_at_origin
+from procedural.root_folder import half_written
 
 VIEWS = 3
 PASSES = 4

@@ -8,8 +8,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from nerfdiff.errors import ConfigError
-from nerfdiff.scenes.mitsuba_renderer import Film, MitsubaRenderer
+from nerfdiff.utils.errors import ConfigError
+from procedural.mitsuba_renderer import Film, MitsubaRenderer
 
 
 @dataclass(frozen=True)

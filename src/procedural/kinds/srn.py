@@ -21,18 +21,18 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from nerfdiff.errors import ConfigError
-from nerfdiff.results.files import publish
-from nerfdiff.scenes.car_proportions import STYLES as CAR_STYLES
-from nerfdiff.scenes.cars import build_car
-from nerfdiff.scenes.chairs import STYLES as CHAIR_STYLES
-from nerfdiff.scenes.chairs import build_chair
-from nerfdiff.scenes.kinds.kind import SceneJob, ascending, check_splits, check_styles, stream
-from nerfdiff.scenes.mesh import Model
-from nerfdiff.scenes.mitsuba_model import ModelWorld
-from nerfdiff.scenes.mitsuba_renderer import Film, MitsubaRenderer
-from nerfdiff.scenes.poses import FOCAL_PER_PIXEL, SPIRAL_VIEWS, random_sphere, srn_spiral
-from nerfdiff.scenes.root_folder import half_written
+from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.files import publish
+from procedural.car_proportions import STYLES as CAR_STYLES
+from procedural.cars import build_car
+from procedural.chairs import STYLES as CHAIR_STYLES
+from procedural.chairs import build_chair
+from procedural.kinds.kind import SceneJob, ascending, check_splits, check_styles, stream
+from procedural.mesh import Model
+from procedural.mitsuba_model import ModelWorld
+from procedural.mitsuba_renderer import Film, MitsubaRenderer
+from procedural.poses import FOCAL_PER_PIXEL, SPIRAL_VIEWS, random_sphere, srn_spiral
+from procedural.root_folder import half_written
 
 SPLITS = ("train", "val", "test")
 BUILDERS = {"cars": build_car, "chairs": build_chair}

@@ -5,15 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from nerfdiff.scenes.chairs import STYLES as CHAIRS
-from nerfdiff.scenes.mesh import Model, Part
-from nerfdiff.scenes.paint import pick
-from nerfdiff.scenes.products.lamps import lamp
-from nerfdiff.scenes.products.materials import cloth, grain
-from nerfdiff.scenes.products.planters import planter
-from nerfdiff.scenes.products.soft import bed, rug, sofa, stool
-from nerfdiff.scenes.products.storage import cabinet, shelf
-from nerfdiff.scenes.products.tables import table
+from procedural.chairs import STYLES as CHAIRS
+from procedural.mesh import Model, Part
+from procedural.paint import pick
+from procedural.products.lamps import lamp
+from procedural.products.materials import cloth, grain
+from procedural.products.planters import planter
+from procedural.products.soft import bed, rug, sofa, stool
+from procedural.products.storage import cabinet, shelf
+from procedural.products.tables import table
 
 UPHOLSTERED = {"cushion", "back", "back_pad", "base", "arm_pad"}
 WOODEN = {"leg", "seat", "back_post", "back_board", "rung", "slat", "crest", "stretcher", "spindle", "back_rail"}

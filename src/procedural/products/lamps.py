@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from nerfdiff.scenes.chair_parts import FABRICS, bar, draw_colour
-from nerfdiff.scenes.mesh import Part, tube
-from nerfdiff.scenes.paint import jitter, pick
-from nerfdiff.scenes.products.materials import Material, ceramic, cloth, metal, wood
-from nerfdiff.scenes.products.pieces import GREY
+from procedural.chair_parts import FABRICS, bar, draw_colour
+from procedural.mesh import Part, tube
+from procedural.paint import jitter, pick
+from procedural.products.materials import Material, ceramic, cloth, metal, wood
+from procedural.products.pieces import GREY
 
 
 def lamp(rng: np.random.Generator) -> list[Part]:

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nerfdiff.scenes.chair_parts import FABRICS, METALS, WOODS, draw_colour
-from nerfdiff.scenes.mesh import Colour, Part
-from nerfdiff.scenes.paint import jitter, pick
-from nerfdiff.scenes.texture import Texture
+from procedural.chair_parts import FABRICS, METALS, WOODS, draw_colour
+from procedural.mesh import Colour, Part
+from procedural.paint import jitter, pick
+from procedural.texture import Texture
 
 CERAMICS: dict[str, tuple[int, Colour]] = {
     "white": (3, (0.90, 0.89, 0.86)),

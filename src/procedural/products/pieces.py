@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from nerfdiff.scenes.chair_parts import bar
-from nerfdiff.scenes.mesh import Part, Point, loft
+from procedural.chair_parts import bar
+from procedural.mesh import Part, Point, loft
 
 # Materials replace the colour that parts are made with.
 GREY = (0.5, 0.5, 0.5)

@@ -3,11 +3,11 @@
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.scenes.chair_parts import bar, sheet
-from nerfdiff.scenes.mesh import Colour, Part, tube
-from nerfdiff.scenes.paint import jitter, pick
-from nerfdiff.scenes.products.materials import ceramic, wood
-from nerfdiff.scenes.products.pieces import GREY, shifted, turned
+from procedural.chair_parts import bar, sheet
+from procedural.mesh import Colour, Part, tube
+from procedural.paint import jitter, pick
+from procedural.products.materials import ceramic, wood
+from procedural.products.pieces import GREY, shifted, turned
 
 SOIL: Colour = (0.20, 0.14, 0.10)
 GREENS: tuple[Colour, ...] = ((0.16, 0.42, 0.16), (0.26, 0.50, 0.20), (0.12, 0.33, 0.22), (0.40, 0.55, 0.24))

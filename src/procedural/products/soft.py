@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from nerfdiff.scenes.chair_parts import FABRICS, bar, draw_colour
-from nerfdiff.scenes.mesh import Part, box, tube
-from nerfdiff.scenes.paint import jitter, pick
-from nerfdiff.scenes.products.materials import Material, fabric, metal, wood
-from nerfdiff.scenes.products.pieces import GREY, corner_legs, leaning, pillow, shifted
-from nerfdiff.scenes.texture import Texture
+from procedural.chair_parts import FABRICS, bar, draw_colour
+from procedural.mesh import Part, box, tube
+from procedural.paint import jitter, pick
+from procedural.products.materials import Material, fabric, metal, wood
+from procedural.products.pieces import GREY, corner_legs, leaning, pillow, shifted
+from procedural.texture import Texture
 
 
 def sofa(rng: np.random.Generator) -> list[Part]:

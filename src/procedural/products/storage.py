@@ -4,10 +4,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from nerfdiff.scenes.chair_parts import FABRICS, bar, draw_colour
-from nerfdiff.scenes.mesh import Part, box, tube
-from nerfdiff.scenes.products.materials import ceramic, metal, wood
-from nerfdiff.scenes.products.pieces import GREY, corner_legs
+from procedural.chair_parts import FABRICS, bar, draw_colour
+from procedural.mesh import Part, box, tube
+from procedural.products.materials import ceramic, metal, wood
+from procedural.products.pieces import GREY, corner_legs
 
 
 def shelf(rng: np.random.Generator) -> list[Part]:

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from nerfdiff.scenes.chair_parts import bar
-from nerfdiff.scenes.mesh import Part, box, loft, tube
-from nerfdiff.scenes.products.materials import metal, stone, wood
-from nerfdiff.scenes.products.pieces import GREY, corner_legs
+from procedural.chair_parts import bar
+from procedural.mesh import Part, box, loft, tube
+from procedural.products.materials import metal, stone, wood
+from procedural.products.pieces import GREY, corner_legs
 
 
 def table(rng: np.random.Generator) -> list[Part]:

@@ -5,8 +5,8 @@ import math
 
 import pytest
 
-from nerfdiff.data.transforms_json import read_transforms
-from nerfdiff.errors import DataError
+from nerfdiff.data.formats.transforms_json import read_transforms
+from nerfdiff.utils.errors import DataError
 from posed_fixtures import CX, CY, FX, FY, HEIGHT, WIDTH, write_nerfstudio
 
 SHARED = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2", "camera_model")

@@ -5,8 +5,8 @@ import OpenEXR
 import pytest
 
 from abo_fixtures import write_exr
-from nerfdiff.data.exr import read_exr
-from nerfdiff.errors import DataError
+from nerfdiff.data.formats.exr import read_exr
+from nerfdiff.utils.errors import DataError
 
 
 @pytest.mark.parametrize("half", [False, True])

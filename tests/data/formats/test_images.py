@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerfdiff.data.images import decode, decode_with_alpha, resize, resize_nearest, stored_size
-from nerfdiff.data.masks import read_mask
-from nerfdiff.errors import DataError
+from nerfdiff.data.formats.images import decode, decode_with_alpha, resize, resize_nearest, stored_size
+from nerfdiff.data.readers.masks import read_mask
+from nerfdiff.utils.errors import DataError
 
 
 def write_png16(path, values: np.ndarray) -> None:

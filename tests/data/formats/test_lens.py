@@ -8,9 +8,9 @@ import pytest
 import torch
 from PIL import Image
 
-from nerfdiff.data.lens import Lens
-from nerfdiff.data.posed_images import PosedImagesReader
-from nerfdiff.errors import DataError
+from nerfdiff.data.formats.lens import Lens
+from nerfdiff.data.readers.posed_images import PosedImagesReader
+from nerfdiff.utils.errors import DataError
 from posed_fixtures import CENTRE, COLOURS, CX, CY, FX, FY, HEIGHT, POINTS, SETTINGS, WIDTH, project, write_nerfstudio
 
 BARREL = {"k1": -0.22, "k2": 0.05, "p1": 0.006, "p2": -0.009}

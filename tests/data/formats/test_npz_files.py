@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from data_fixtures import FAR, HEIGHT, NEAR, WIDTH, write_srn
-from nerfdiff.data.npz_files import read_array
-from nerfdiff.data.srn import SRNReader
-from nerfdiff.errors import DataError
+from nerfdiff.data.formats.npz_files import read_array
+from nerfdiff.data.readers.srn import SRNReader
+from nerfdiff.utils.errors import DataError
 
 
 def test_one_array_is_read_whatever_the_others_are(tmp_path):

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from nerfdiff.data.transforms_json import find_image, is_scene, read_transforms
-from nerfdiff.errors import DataError
+from nerfdiff.data.formats.transforms_json import find_image, is_scene, read_transforms
+from nerfdiff.utils.errors import DataError
 from posed_fixtures import CX, CY, FX, FY, HEIGHT, WIDTH, cameras, write_blender, write_nerfstudio
 
 GL_TO_CV = np.diag([1.0, -1, -1, 1])

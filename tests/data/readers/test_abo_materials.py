@@ -24,11 +24,11 @@ from abo_fixtures import (
     write_material_item,
     write_materials,
 )
-from nerfdiff.data import item_folders as item_folders_module
-from nerfdiff.data.abo_material_files import read_split
-from nerfdiff.data.abo_materials import ABOMaterials
+from nerfdiff.data.readers import item_folders as item_folders_module
+from nerfdiff.data.readers.abo_material_files import read_split
+from nerfdiff.data.readers.abo_materials import ABOMaterials
 from nerfdiff.data.scene import MissingSplit, SceneReader
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.utils.errors import ConfigError, DataError
 
 CONF = str(Path(__file__).parents[2] / "conf")
 SETTINGS = {

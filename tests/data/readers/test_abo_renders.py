@@ -25,10 +25,10 @@ from abo_fixtures import (
     write_item,
     write_renders,
 )
-from nerfdiff.data import item_folders as item_folders_module
-from nerfdiff.data.abo_renders import ABORenders
+from nerfdiff.data.readers import item_folders as item_folders_module
+from nerfdiff.data.readers.abo_renders import ABORenders
 from nerfdiff.data.scene import MissingSplit, SceneReader
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.utils.errors import ConfigError, DataError
 
 CONF = str(Path(__file__).parents[2] / "conf")
 SETTINGS = {

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from nerfdiff.data.bounds import MIN_NEAR, Gaze
-from nerfdiff.errors import DataError
+from nerfdiff.data.readers.bounds import MIN_NEAR, Gaze
+from nerfdiff.utils.errors import DataError
 
 
 def looking(centres: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -26,9 +26,9 @@ from clevr_fixtures import (
     write_clevr3d,
 )
 from nerfdiff.cli import load_config
-from nerfdiff.data.clevr3d import Clevr3DReader
+from nerfdiff.data.readers.clevr3d import Clevr3DReader
 from nerfdiff.data.scene import MissingSplit, SceneReader
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.utils.errors import ConfigError, DataError
 
 SPLITS = {"train": [0, 2], "val": [2, 3], "test": [3, 4]}
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from nerfdiff.data.framing import Framing
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.data.readers.framing import Framing
+from nerfdiff.utils.errors import ConfigError, DataError
 
 K = np.array([[50.0, 0, 27.0], [0, 48.0, 21.5], [0, 0, 1]])
 

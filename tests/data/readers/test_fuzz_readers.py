@@ -15,14 +15,14 @@ import abo_fixtures
 import clevr_fixtures
 import posed_fixtures
 from data_fixtures import FAR, NEAR, write_srn
-from nerfdiff.data.abo_materials import ABOMaterials
-from nerfdiff.data.abo_renders import ABORenders
-from nerfdiff.data.clevr3d import Clevr3DReader
-from nerfdiff.data.posed_images import PosedImagesReader
+from nerfdiff.data.readers.abo_materials import ABOMaterials
+from nerfdiff.data.readers.abo_renders import ABORenders
+from nerfdiff.data.readers.clevr3d import Clevr3DReader
+from nerfdiff.data.readers.posed_images import PosedImagesReader
+from nerfdiff.data.readers.srn import SRNReader
 from nerfdiff.data.scene import SceneReader
-from nerfdiff.data.srn import SRNReader
-from nerfdiff.errors import ConfigError, DataError
 from nerfdiff.inspection.all_views import refuse_missing_files
+from nerfdiff.utils.errors import ConfigError, DataError
 
 MUTATIONS_PER_READER = 80
 

@@ -4,8 +4,8 @@ import os
 
 import pytest
 
-from nerfdiff.data.index import cached_index, folder_stamp, index_name
-from nerfdiff.errors import DataError
+from nerfdiff.data.readers.index import cached_index, folder_stamp, index_name
+from nerfdiff.utils.errors import DataError
 
 
 class Scan:

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerfdiff.data.framing import Framing
-from nerfdiff.data.masks import border, likely_misreading, read_mask, stacked_masks
-from nerfdiff.errors import DataError
+from nerfdiff.data.readers.framing import Framing
+from nerfdiff.data.readers.masks import border, likely_misreading, read_mask, stacked_masks
+from nerfdiff.utils.errors import DataError
 
 Y, X = np.mgrid[:48, :64]
 WHERE = (X - 30) ** 2 + (Y - 22) ** 2 < 14**2

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from abo_fixtures import blender_poses
-from nerfdiff.data.optical_axes import check_settings, object_cameras, report
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.data.readers.optical_axes import check_settings, object_cameras, report
+from nerfdiff.utils.errors import ConfigError, DataError
 
 FLIP = np.diag([1.0, -1, -1, 1])
 CENTRE = np.array([0.4, -0.2, 1.3])

@@ -14,11 +14,11 @@ from hydra.utils import instantiate
 from PIL import Image
 
 from nerfdiff.cli import load_config
-from nerfdiff.data import posed_images
 from nerfdiff.data.cache import CachedReader
-from nerfdiff.data.posed_images import PosedImagesReader
+from nerfdiff.data.readers import posed_images
+from nerfdiff.data.readers.posed_images import PosedImagesReader
 from nerfdiff.data.scene import MissingSplit, SceneReader
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.utils.errors import ConfigError, DataError
 from posed_fixtures import (
     COLOURS,
     CX,
@@ -247,7 +247,7 @@ def test_too_few_scenes_for_a_split(tmp_path):
 
 def test_bounds_are_estimated_and_said(tmp_path, caplog):
     write_nerfstudio(tmp_path / "shoe", views=20)
-    with caplog.at_level(logging.INFO, "nerfdiff.data.posed_images"):
+    with caplog.at_level(logging.INFO, "nerfdiff.data.readers.posed_images"):
         scene = read(tmp_path).load(0, [0])
     radius = 3 * math.sin(math.atan(WIDTH / 2 / FX))
     assert scene.near == pytest.approx(2.8 - radius, abs=0.15) and scene.far == pytest.approx(3.2 + radius, abs=0.15)
@@ -278,7 +278,7 @@ def test_bounds_come_from_the_file_or_from_the_config(tmp_path, caplog):
     assert [getattr(read(tmp_path).load(0, [0]), key) for key in ("near", "far")] == [1.0, 5.0]
     assert [getattr(read(tmp_path, far=7.0).load(0, [0]), key) for key in ("near", "far")] == [1.0, 7.0]
     caplog.clear()
-    with caplog.at_level(logging.INFO, "nerfdiff.data.posed_images"):
+    with caplog.at_level(logging.INFO, "nerfdiff.data.readers.posed_images"):
         assert [getattr(read(tmp_path, near=2, far=9).load(0, [0]), key) for key in ("near", "far")] == [2.0, 9.0]
     assert not caplog.messages
     with pytest.raises(DataError, match=r"stated: near = 6 and far = 5, partly.*set both data\.reader\.near"):

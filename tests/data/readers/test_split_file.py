@@ -5,9 +5,9 @@ import logging
 
 import pytest
 
-from nerfdiff.data import split_file
-from nerfdiff.data.split_file import draw_split, seeded_order, stored_split
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.data.readers import split_file
+from nerfdiff.data.readers.split_file import draw_split, seeded_order, stored_split
+from nerfdiff.utils.errors import ConfigError, DataError
 
 SIZES = {"train": 6743, "val": 396, "test": 794}
 

@@ -8,9 +8,9 @@ import torch
 from PIL import Image
 
 from data_fixtures import COLOURS, CX, CY, FAR, HEIGHT, NEAR, POINTS, WIDTH, F, draw, visible, write_scene, write_srn
+from nerfdiff.data.readers.srn import SRNReader
 from nerfdiff.data.scene import MissingSplit
-from nerfdiff.data.srn import SRNReader
-from nerfdiff.errors import DataError
+from nerfdiff.utils.errors import DataError
 
 
 def read(root, split="train", category="cars", image_size=None) -> SRNReader:

@@ -5,8 +5,8 @@ import pytest
 from PIL import Image
 
 from data_fixtures import FAR, HEIGHT, NEAR, WIDTH, write_srn
-from nerfdiff.data.srn import SRNReader
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.data.readers.srn import SRNReader
+from nerfdiff.utils.errors import ConfigError, DataError
 
 
 def damage(root, name: str, change) -> None:

@@ -12,11 +12,11 @@ from PIL import Image
 import abo_fixtures
 import clevr_fixtures
 import posed_fixtures
-from nerfdiff.data.abo_materials import ABOMaterials
-from nerfdiff.data.abo_renders import ABORenders
 from nerfdiff.data.batch import Sample, ViewBatch
-from nerfdiff.data.clevr3d import Clevr3DReader
-from nerfdiff.data.posed_images import PosedImagesReader
+from nerfdiff.data.readers.abo_materials import ABOMaterials
+from nerfdiff.data.readers.abo_renders import ABORenders
+from nerfdiff.data.readers.clevr3d import Clevr3DReader
+from nerfdiff.data.readers.posed_images import PosedImagesReader
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.metrics.depth import depth_errors, mask_iou
 from nerfdiff.metrics.image import psnr, ssim, ssim_gaussian

@@ -6,9 +6,9 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from torch.utils.data import DataLoader
 
-from nerfdiff.callbacks.checkpoint import LastCheckpoint
-from nerfdiff.callbacks.ema import EMA
 from nerfdiff.stopping import Stopped
+from nerfdiff.training.callbacks.checkpoint import LastCheckpoint
+from nerfdiff.training.callbacks.ema import EMA
 
 
 class Line(LightningModule):

@@ -5,8 +5,8 @@ import torch
 from lightning import LightningModule, Trainer
 from torch.utils.data import DataLoader
 
-from nerfdiff.callbacks.nonfinite import NonFiniteGuard
-from nerfdiff.errors import TrainingDiverged
+from nerfdiff.training.callbacks.nonfinite import NonFiniteGuard
+from nerfdiff.utils.errors import TrainingDiverged
 
 
 class Sometimes(LightningModule):

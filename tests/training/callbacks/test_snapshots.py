@@ -4,8 +4,8 @@ import torch
 from lightning import LightningModule, Trainer
 from torch.utils.data import DataLoader
 
-from nerfdiff.callbacks.snapshots import Snapshots, average_of, combination, exponent_of, products
-from nerfdiff.errors import CheckpointError, ConfigError
+from nerfdiff.training.callbacks.snapshots import Snapshots, average_of, combination, exponent_of, products
+from nerfdiff.utils.errors import CheckpointError, ConfigError
 
 
 class Walk(LightningModule):

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from nerfdiff.callbacks.stability import Stability
+from nerfdiff.training.callbacks.stability import Stability
 
 
 def test_the_99th_percentile_is_known_to_a_percent_without_keeping_the_norms():

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.data.json_files import number
-from nerfdiff.errors import DataError
+from nerfdiff.data.formats.json_files import number
+from nerfdiff.utils.errors import DataError
 
 FITS = ("AUTO", "HORIZONTAL", "VERTICAL")
 

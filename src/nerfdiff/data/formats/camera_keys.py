@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.data.json_files import matrix, optional_number
-from nerfdiff.errors import DataError
+from nerfdiff.data.formats.json_files import matrix, optional_number
+from nerfdiff.utils.errors import DataError
 
 ALIASES = {
     "fx": ("fl_x",),

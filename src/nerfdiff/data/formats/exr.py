@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.errors import DataError
+from nerfdiff.utils.errors import DataError
 
 DEPTH_CHANNELS = ("Z", "V", "R", "Y")
 """Names under which renderers store one value; Blender's file output names it V, or repeats it in R, G and B."""

@@ -11,9 +11,8 @@ from jaxtyping import Bool, Float, Integer, UInt8
 from PIL import Image, ImageOps, UnidentifiedImageError
 from PIL.ExifTags import Base
 
-from nerfdiff.data.pinhole import ASPECT_TOLERANCE
-from nerfdiff.data.posed_files import require_file
-from nerfdiff.errors import DataError
+from nerfdiff.data.formats.posed_files import ASPECT_TOLERANCE, require_file
+from nerfdiff.utils.errors import DataError
 
 MAX_PIXELS = 64_000_000
 """Of an image, which takes some 25 bytes of memory each until it is resized."""

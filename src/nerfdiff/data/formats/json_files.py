@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.data.posed_files import read_text
-from nerfdiff.errors import DataError
+from nerfdiff.data.formats.posed_files import read_text
+from nerfdiff.utils.errors import DataError
 
 
 def read_json(path: Path, expected: str) -> dict[str, Any]:

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Bool, Float32, UInt8
 from torch import Tensor
 
-from nerfdiff.data.json_files import optional_number
-from nerfdiff.errors import DataError
+from nerfdiff.data.formats.json_files import optional_number
+from nerfdiff.utils.errors import DataError
 
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
 """Camera models whose distortion, if they have any, is that of `Lens`."""

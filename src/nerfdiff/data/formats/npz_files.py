@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.data.posed_files import require_file
-from nerfdiff.errors import DataError
+from nerfdiff.data.formats.posed_files import require_file
+from nerfdiff.utils.errors import DataError
 
 
 def read_array(path: Path, key: str, expected: str) -> np.ndarray:

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.data.camera_keys import camera_keys, frame_camera
-from nerfdiff.data.json_files import entry, matrix, optional_number, read_json
-from nerfdiff.data.lens import Lens
-from nerfdiff.data.posed_files import check_rigid
-from nerfdiff.data.transforms_pinhole import Pinhole
-from nerfdiff.errors import DataError
+from nerfdiff.data.formats.camera_keys import camera_keys, frame_camera
+from nerfdiff.data.formats.json_files import entry, matrix, optional_number, read_json
+from nerfdiff.data.formats.lens import Lens
+from nerfdiff.data.formats.posed_files import check_rigid
+from nerfdiff.data.formats.transforms_pinhole import Pinhole
+from nerfdiff.utils.errors import DataError
 
 ONE_FILE = "transforms.json"
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")

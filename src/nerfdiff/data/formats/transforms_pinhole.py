@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.data.json_files import optional_number
-from nerfdiff.data.pinhole import ASPECT_TOLERANCE, is_focal
-from nerfdiff.errors import DataError
+from nerfdiff.data.formats.json_files import optional_number
+from nerfdiff.data.formats.posed_files import ASPECT_TOLERANCE, is_focal
+from nerfdiff.utils.errors import DataError
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.data.json_files import entry, matrix, read_list
-from nerfdiff.data.posed_files import read_text
-from nerfdiff.errors import DataError, some
+from nerfdiff.data.formats.json_files import entry, matrix, read_list
+from nerfdiff.data.formats.posed_files import read_text
+from nerfdiff.utils.errors import DataError, some
 
 KEY_FILE = "metadata.json"
 SPLIT_FILE = "train_test_split.csv"

@@ -20,25 +20,24 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras
-from nerfdiff.data import images
-from nerfdiff.data.abo_material_files import (
+from nerfdiff.data.formats import images
+from nerfdiff.data.formats.exr import read_exr
+from nerfdiff.data.formats.posed_files import check_K
+from nerfdiff.data.readers.abo_material_files import (
     KEY_FILE,
     MaterialViews,
     find_split_file,
     numbered_files,
     read_split,
 )
-from nerfdiff.data.exr import read_exr
-from nerfdiff.data.framing import Framing
-from nerfdiff.data.index import cached_index, folder_stamp, index_name
-from nerfdiff.data.item_folders import item_folders
-from nerfdiff.data.masks import read_mask
-from nerfdiff.data.optical_axes import ObjectCameras, check_settings, object_cameras, report
-from nerfdiff.data.pinhole import check_K
+from nerfdiff.data.readers.framing import Framing, stack_pixels
+from nerfdiff.data.readers.index import cached_index, folder_stamp, index_name
+from nerfdiff.data.readers.item_folders import item_folders
+from nerfdiff.data.readers.masks import read_mask
+from nerfdiff.data.readers.optical_axes import ObjectCameras, check_settings, object_cameras, report
+from nerfdiff.data.readers.split_file import seeded_order
 from nerfdiff.data.scene import Listing, MissingSplit, Scene
-from nerfdiff.data.split_file import seeded_order
-from nerfdiff.data.view_stack import stack_pixels
-from nerfdiff.errors import ConfigError, DataError, some
+from nerfdiff.utils.errors import ConfigError, DataError, some
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 NOTHING = 65000.0

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from nerfdiff.data.optical_axes import closest_point
-from nerfdiff.errors import DataError, some
+from nerfdiff.data.readers.optical_axes import closest_point
+from nerfdiff.utils.errors import DataError, some
 
 MIN_SPREAD = 0.005
 """Mean squared sine between the optical axes and their main direction (4° root mean square) below which where they

@@ -13,17 +13,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from nerfdiff.cameras import Cameras
-from nerfdiff.data import images
-from nerfdiff.data.clevr3d_metadata import camera_positions, object_counts
-from nerfdiff.data.framing import Framing
-from nerfdiff.data.index import folder_stamp
-from nerfdiff.data.pinhole import ASPECT_TOLERANCE
+from nerfdiff.data.formats import images
+from nerfdiff.data.formats.npz_files import read_array
+from nerfdiff.data.formats.posed_files import ASPECT_TOLERANCE
+from nerfdiff.data.readers.framing import Framing, stack_pixels
+from nerfdiff.data.readers.index import folder_stamp
 from nerfdiff.data.scene import Listing, MissingSplit, Scene
-from nerfdiff.data.view_stack import stack_pixels
-from nerfdiff.errors import ConfigError, DataError, some
+from nerfdiff.utils.errors import ConfigError, DataError, some
 
 PARENTS = ("", "clevr3d")
 DEPTH_RANGE = 40.0
@@ -266,3 +265,28 @@ def _z_depth(file: Path, levels: np.ndarray, K: Float[np.ndarray, "3 3"]) -> Flo
     y = (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
     distance = np.where(levels < DEPTH_LEVELS - 1, levels * (DEPTH_RANGE / DEPTH_LEVELS), 0)
     return (distance / np.sqrt(1 + x**2 + y[:, None] ** 2)).astype(np.float32)
+
+
+def camera_positions(metadata: Path) -> Float[np.ndarray, "scenes views 3"]:
+    """`camera_pos` in single precision.
+
+    Raises:
+        DataError: the file is damaged, or the array missing or of another shape.
+    """
+    positions = read_array(metadata, "camera_pos", "[scenes, views, 3]")
+    if positions.ndim != 3 or positions.shape[2] != 3 or 0 in positions.shape:
+        raise DataError(f"{metadata}: expected camera_pos [scenes, views, 3], found shape {list(positions.shape)}")
+    with np.errstate(over="ignore"):  # the reader refuses infinite positions with their scene's number
+        return positions.astype(np.float32)
+
+
+def object_counts(metadata: Path, scenes: int) -> Int[np.ndarray, " scenes"]:
+    """How many of each scene's slots in `shape` hold an object; 0 is an empty slot.
+
+    Raises:
+        DataError: as `camera_positions`.
+    """
+    shape = read_array(metadata, "shape", f"[{scenes}, objects]")
+    if shape.ndim != 2 or len(shape) != scenes:
+        raise DataError(f"{metadata}: expected shape [{scenes}, objects], found shape {list(shape.shape)}")
+    return (shape > 0).sum(1)

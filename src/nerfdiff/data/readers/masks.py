@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool, Real
 from PIL import Image
 
-from nerfdiff.data.framing import Framing
-from nerfdiff.data.images import open_image
-from nerfdiff.errors import DataError
+from nerfdiff.data.formats.images import open_image
+from nerfdiff.data.readers.framing import Framing
+from nerfdiff.utils.errors import DataError
 
 FEW = 8
 """Up to so many levels an image shows labels rather than soft edges."""

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.data.posed_files import check_rigid, inverse_pose
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.data.formats.posed_files import check_rigid, inverse_pose
+from nerfdiff.utils.errors import ConfigError, DataError
 
 CONVENTIONS = ("auto", "opengl", "opencv")
 RESIDUAL_TOLERANCE = 0.05

@@ -21,17 +21,16 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from nerfdiff.cameras import Cameras
-from nerfdiff.data import images
-from nerfdiff.data.bounds import Gaze
-from nerfdiff.data.framing import Framing
-from nerfdiff.data.index import folder_stamp
-from nerfdiff.data.masks import likely_misreading, read_mask, stacked_masks
-from nerfdiff.data.posed_files import MAX_POSITION
-from nerfdiff.data.posed_folders import find_scenes
-from nerfdiff.data.scene import Listing, Scene
-from nerfdiff.data.transforms_json import Frame, Transforms, read_transforms
-from nerfdiff.data.view_stack import stack_pixels
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.data.formats import images
+from nerfdiff.data.formats.posed_files import MAX_POSITION
+from nerfdiff.data.formats.transforms_json import ONE_FILE, SPLIT_FILES, Frame, Transforms, is_scene, read_transforms
+from nerfdiff.data.readers.bounds import Gaze
+from nerfdiff.data.readers.framing import Framing, stack_pixels
+from nerfdiff.data.readers.index import folder_stamp
+from nerfdiff.data.readers.masks import likely_misreading, read_mask, stacked_masks
+from nerfdiff.data.readers.split_file import draw_split
+from nerfdiff.data.scene import Listing, MissingSplit, Scene
+from nerfdiff.utils.errors import ConfigError, DataError
 
 CONVENTIONS = ("opengl", "opencv")
 MISSING_IMAGES = ("error", "skip")
@@ -261,3 +260,51 @@ def _visible(folder: Path) -> list[Path]:
             return sorted(Path(entry.path) for entry in entries if not entry.name.startswith("."))
     except OSError as error:
         raise DataError(f"{folder}: the scene's folder cannot be listed ({error.strerror})") from error
+
+
+def find_scenes(root: Path, split: str, split_sizes: Mapping[str, int], seed: int) -> tuple[Path, ...]:
+    """The scene folders of a split, sorted by name. Apart from listing `root`, no folder is looked into.
+
+    A folder that is itself a scene is every split. Folders named as splits hold the scenes of these. Else every folder
+    is a scene, a single one is every split, and several are shared out by `split_file.draw_split`.
+
+    Raises:
+        ConfigError: an unknown split.
+        MissingSplit: the scenes lie in folders for other splits, or are too few; or the split's folder is empty.
+        DataError: `root` is missing or has no scenes.
+    """
+    if split not in split_sizes:
+        raise ConfigError(f"split {split!r} is unknown; choose one of {', '.join(split_sizes)}")
+    wanted = f"{ONE_FILE} (or {', '.join(SPLIT_FILES)})"
+    if not root.is_dir():
+        raise DataError(f"{root}: no such folder; set data.root to a folder of scenes, each with its {wanted}")
+    if is_scene(root):
+        return (root,)
+    folders = _folders(root)
+    laid_out = [folder.name for folder in folders if folder.name in split_sizes]
+    if laid_out:
+        if split not in laid_out:
+            raise MissingSplit(f"{root}: no {split} split; found only {', '.join(laid_out)}")
+        scenes = _folders(root / split)
+        if not scenes:
+            raise MissingSplit(
+                f"{root / split}: the split is empty; expected one folder per scene, each with its {wanted}"
+            )
+        return scenes
+    if not folders:
+        raise DataError(f"{root}: no scenes; expected one folder per scene, each with its {wanted}")
+    if len(folders) == 1:
+        return folders
+    names = draw_split([folder.name for folder in folders], split_sizes, seed)[split]
+    if not names:
+        raise MissingSplit(
+            f"{root}: {len(folders)} scenes are too few for a {split} split of {split_sizes[split]} in "
+            f"{sum(split_sizes.values())}; put them into folders {', '.join(split_sizes)}, or change "
+            "data.reader.split_sizes"
+        )
+    return tuple(root / name for name in names)
+
+
+def _folders(folder: Path) -> tuple[Path, ...]:
+    with os.scandir(folder) as entries:
+        return tuple(sorted(Path(e.path) for e in entries if e.is_dir() and not e.name.startswith(".")))

@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
-from nerfdiff.data.index import index_name
-from nerfdiff.data.json_files import entry, read_json
-from nerfdiff.errors import ConfigError, DataError, some
-from nerfdiff.results.files import write_text
-from nerfdiff.results.hashes import sha256_values
+from nerfdiff.data.formats.json_files import entry, read_json
+from nerfdiff.data.readers.index import index_name
+from nerfdiff.utils.errors import ConfigError, DataError, some
+from nerfdiff.utils.files import write_text
+from nerfdiff.utils.hashes import sha256_values
 
 log = logging.getLogger(__name__)
 

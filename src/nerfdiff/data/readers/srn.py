@@ -16,16 +16,15 @@ import torch
 from jaxtyping import Float
 
 from nerfdiff.cameras import Cameras
-from nerfdiff.data import images
-from nerfdiff.data.fingerprint import fingerprint_folders
-from nerfdiff.data.framing import Framing
-from nerfdiff.data.masks import read_mask
-from nerfdiff.data.npz_files import read_depth
-from nerfdiff.data.posed_files import inverse_pose, read_pose
+from nerfdiff.data.formats import images
+from nerfdiff.data.formats.npz_files import read_depth
+from nerfdiff.data.formats.posed_files import inverse_pose, read_pose
+from nerfdiff.data.readers.framing import Framing, stack_pixels
+from nerfdiff.data.readers.index import fingerprint_folders
+from nerfdiff.data.readers.masks import read_mask
+from nerfdiff.data.readers.srn_intrinsics import SceneIntrinsics, read_view_intrinsics
 from nerfdiff.data.scene import Listing, MissingSplit, Scene
-from nerfdiff.data.srn_intrinsics import SceneIntrinsics, read_view_intrinsics
-from nerfdiff.data.view_stack import stack_pixels
-from nerfdiff.errors import ConfigError, DataError, some
+from nerfdiff.utils.errors import ConfigError, DataError, some
 
 SPLITS = ("train", "val", "test")
 PARENTS = ("", "srn_{category}", "srn_{category}/srn_{category}")

@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.data.pinhole import ASPECT_TOLERANCE, check_K, is_focal
-from nerfdiff.data.posed_files import read_numbers, read_text
-from nerfdiff.errors import DataError
+from nerfdiff.data.formats.posed_files import ASPECT_TOLERANCE, check_K, is_focal, read_numbers, read_text
+from nerfdiff.utils.errors import DataError
 
 
 @dataclass(frozen=True)

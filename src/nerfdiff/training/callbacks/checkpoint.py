@@ -12,12 +12,12 @@ from lightning import LightningModule, Trainer
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from nerfdiff.callbacks.nonfinite import NonFiniteGuard
 from nerfdiff.checkpoint import DIVERGED, LAST, PREVIOUS
-from nerfdiff.errors import CheckpointError, DataError, TrainingDiverged, size_text
 from nerfdiff.processes import is_launched
-from nerfdiff.results.files import atomic
 from nerfdiff.stopping import Stopped, on_signals
+from nerfdiff.training.callbacks.nonfinite import NonFiniteGuard
+from nerfdiff.utils.errors import CheckpointError, DataError, TrainingDiverged, size_text
+from nerfdiff.utils.files import atomic
 
 log = logging.getLogger(__name__)
 

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn.utils import get_total_norm
 from torch.optim import Optimizer
 
-from nerfdiff.callbacks.stability import Stability
-from nerfdiff.errors import TrainingDiverged
+from nerfdiff.training.callbacks.stability import Stability
+from nerfdiff.utils.errors import TrainingDiverged
 
 
 class NonFiniteGuard(Callback):

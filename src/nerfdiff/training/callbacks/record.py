@@ -5,7 +5,7 @@ from pathlib import Path
 from lightning import Callback, LightningModule, Trainer
 from omegaconf import DictConfig, OmegaConf
 
-from nerfdiff.results.files import write_text
+from nerfdiff.utils.files import write_text
 
 
 class Record(Callback):

@@ -18,8 +18,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from nerfdiff.errors import CheckpointError, ConfigError
-from nerfdiff.results.files import atomic
+from nerfdiff.utils.errors import CheckpointError, ConfigError
+from nerfdiff.utils.files import atomic
 
 log = logging.getLogger(__name__)
 

@@ -30,7 +30,7 @@ from nerfdiff.distill.virtual_views import VirtualViews
 from nerfdiff.fit.inner_steps import InnerSteps
 from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.model import NerfDiff
-from nerfdiff.training.run import plain
+from nerfdiff.utils.config import plain
 from nerfdiff.utils.errors import ConfigError
 from report import Report
 from subjects import Subject, scene, subject

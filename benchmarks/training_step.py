@@ -24,7 +24,7 @@ from nerfdiff.model import NerfDiff
 from nerfdiff.render.renderer import Renderer
 from nerfdiff.training.memory import largest_batch, within_memory
 from nerfdiff.training.module import NerfDiffModule
-from nerfdiff.training.run import plain
+from nerfdiff.utils.config import plain
 from report import Report
 from subjects import Subject, scene, subject
 from variants import as_kind, kinds, renderers

@@ -16,7 +16,7 @@ from nerfdiff.field.pixel_features import PixelFeatures
 from nerfdiff.field.residual_mlp import ResidualMLP
 from nerfdiff.model import NerfDiff, build_on_meta
 from nerfdiff.training.memory import training_memory
-from nerfdiff.training.run import plain
+from nerfdiff.utils.config import plain
 from nerfdiff.utils.errors import ConfigError
 from pixel_fixtures import ENCODERS, pixel_config
 

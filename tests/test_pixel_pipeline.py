@@ -8,7 +8,8 @@ from nerfdiff.cli import load_config
 from nerfdiff.evaluation.distill import distill
 from nerfdiff.evaluation.evaluate import evaluate
 from nerfdiff.results.row import read_rows
-from nerfdiff.training.run import plain, train
+from nerfdiff.training.run import train
+from nerfdiff.utils.config import plain
 from nerfdiff.utils.errors import CheckpointError, ConfigError
 from training_fixtures import evaluation_overrides, last_checkpoint, overrides, write_dataset
 

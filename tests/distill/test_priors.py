@@ -10,11 +10,11 @@ from nerfdiff.cameras import Cameras
 from nerfdiff.cli import load_config
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.priors import Circle, OwnViews, Prior, Sphere, SRNSpiral, all_cameras, plane_normal
+from nerfdiff.poses import look_at_origin
 from nerfdiff.trajectories import look_at_point
 from nerfdiff.utils.errors import ConfigError, DataError
 from procedural.kinds.clevr3d import Clevr3DScenes
 from procedural.kinds.kind import SceneJob
-from procedural.poses import look_at_origin
 
 K = torch.tensor([[20.0, 0, 9.0], [0, 20.0, 7.0], [0, 0, 1]])
 

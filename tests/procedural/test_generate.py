@@ -9,9 +9,9 @@ from hydra import compose, initialize_config_dir
 from PIL import Image
 
 from nerfdiff.data.readers.srn import SRNReader
+from nerfdiff.poses import srn_spiral
 from nerfdiff.utils.errors import ConfigError, DataError
 from procedural.generate import make_scenes
-from procedural.poses import srn_spiral
 
 CONF = Path(__file__).parents[2] / "conf"
 

@@ -5,13 +5,14 @@ import pytest
 import torch
 
 from nerfdiff.cameras import Cameras
+from nerfdiff.poses import look_at_origin
 from nerfdiff.utils.errors import ConfigError
 from procedural.cars import build_car
 from procedural.colour import linear_to_srgb8, rgba, srgb_to_linear
 from procedural.mesh import Model, box
 from procedural.mitsuba_model import ModelWorld
 from procedural.mitsuba_renderer import Film, MitsubaRenderer, resolve_variant, robust_mean
-from procedural.poses import look_at_origin, random_sphere
+from procedural.poses import random_sphere
 from procedural.texture import Texture
 
 SIZE = 48

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from nerfdiff.poses import look_at_origin, srn_spiral
 from procedural.kinds.srn import intrinsics_text, pose_text
-from procedural.poses import look_at, look_at_origin, random_sphere, srn_spiral
+from procedural.poses import look_at, random_sphere
 
 # Pose files 0, 1, 64, 100 and 250 of a test car rendered on the spiral of SRN-ShapeNet.
 # fmt: off

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from nerfdiff.evaluation import measure
 from nerfdiff.metrics.predictions import FORMAT
+from nerfdiff.metrics.summary import read_scores
 from nerfdiff.results.intervals import Bootstrap
 from nerfdiff.results.row import ResultRow, append_row, read_rows
 from nerfdiff.sweeps import grid as sweep_grid
@@ -21,7 +22,7 @@ from nerfdiff.sweeps import orbits as sweep_orbits
 from nerfdiff.sweeps import table as sweep_table
 from nerfdiff.sweeps.frontier import Frontier
 from nerfdiff.sweeps.jobs import Job, counterpart, group, jobs_of, planned
-from nerfdiff.sweeps.lines import lines_of, read_scores
+from nerfdiff.sweeps.lines import lines_of
 from nerfdiff.sweeps.table import SweepTable
 from nerfdiff.sweeps.text import to_csv, to_markdown, to_rich
 from nerfdiff.utils.errors import ConfigError, DataError

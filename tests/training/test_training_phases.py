@@ -9,9 +9,9 @@ import torch.nn.functional as F
 from safetensors.torch import save_file
 
 from model_fixtures import config
+from nerfdiff.averages import average_of
 from nerfdiff.checkpoint import export, load_model
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.training.callbacks.snapshots import average_of
 from nerfdiff.training.kept_renderings import KeptRenderings
 from nerfdiff.training.module import NerfDiffModule
 from nerfdiff.utils.errors import CheckpointError, ConfigError

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.batch import ViewBatch
+from nerfdiff.poses import SPIRAL_VIEWS, srn_spiral
 from nerfdiff.trajectories import look_at, look_at_point
 from nerfdiff.utils.errors import ConfigError, DataError
-from procedural.poses import SPIRAL_VIEWS, srn_spiral
 
 
 @runtime_checkable

@@ -23,7 +23,7 @@ from nerfdiff.evaluation.subject import Subject, choose_device, dataset_subject,
 from nerfdiff.processes import end_launched, lost_process, watch
 from nerfdiff.results.row import ResultRow
 from nerfdiff.stopping import Stopped
-from nerfdiff.training.run import plain
+from nerfdiff.utils.config import plain
 from nerfdiff.utils.errors import ConfigError, ProcessLost
 
 log = logging.getLogger(__name__)

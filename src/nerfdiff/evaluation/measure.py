@@ -23,7 +23,7 @@ from nerfdiff.metrics.predictions import NonFinitePrediction
 from nerfdiff.metrics.score import Scorer, truth_from
 from nerfdiff.results.environment import environment
 from nerfdiff.results.row import ResultRow, append_row
-from nerfdiff.training.run import plain
+from nerfdiff.utils.config import plain
 from nerfdiff.utils.errors import ConfigError, TimeUp, is_out_of_memory
 from nerfdiff.utils.hashes import sha256_values
 

@@ -18,7 +18,7 @@ from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.diffusion.layout import channels_last
 from nerfdiff.model import NerfDiff
 from nerfdiff.results.environment import hardware
-from nerfdiff.training.run import auto_precision, plain
+from nerfdiff.utils.config import auto_precision, plain
 from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.hashes import sha256_file, sha256_values
 

@@ -21,9 +21,8 @@ from nerfdiff.metrics.predictions import SCENE, Prediction, read_plan, read_pred
 from nerfdiff.metrics.sets import FrechetDistance, InceptionFeatures, inception_weights
 from nerfdiff.metrics.summary import IMAGE_METRICS, SCENE_METRICS, SceneScores, Value, summarise, write_csv
 from nerfdiff.metrics.whole_scene import Geometry, WholeScene
-from nerfdiff.results.row import encode
 from nerfdiff.utils.errors import DataError
-from nerfdiff.utils.files import write_text
+from nerfdiff.utils.files import encode, write_text
 
 Truth = Callable[[str, Sequence[str]], Scene]
 

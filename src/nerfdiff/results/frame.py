@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from nerfdiff.metrics.summary import FRECHET, PER_SCENE, read_scores
 from nerfdiff.results.inside import inside
 from nerfdiff.results.intervals import Bootstrap, Estimate, spread
-from nerfdiff.results.row import ResultRow, RowFile, flatten
-from nerfdiff.sweeps.jobs import RESULTS
-from nerfdiff.sweeps.lines import FRECHET, PER_SCENE, read_scores
+from nerfdiff.results.row import RESULTS, ResultRow, RowFile, flatten
 from nerfdiff.utils.errors import DataError
 
 log = logging.getLogger(__name__)

@@ -10,13 +10,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
 from nerfdiff.results.inside import inside
-from nerfdiff.results.row import ResultRow, RowFile
+from nerfdiff.results.row import RESULTS, ResultRow, RowFile
 from nerfdiff.sweeps.plan import read_plan
 from nerfdiff.utils.errors import DataError
 
 log = logging.getLogger(__name__)
 
-RESULTS = "results.jsonl"
 SEED = "seed"
 NOT_RUN = "not run"
 

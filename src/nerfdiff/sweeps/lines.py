@@ -1,23 +1,18 @@
 """What a sweep measured: one line per group of jobs, over its seeds and scenes."""
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nerfdiff.metrics.summary import IMAGE_METRICS, SCENE_METRICS
+from nerfdiff.metrics.summary import FRECHET, PER_SCENE, read_scores
 from nerfdiff.results.intervals import Bootstrap, Estimate, mean_of, spread
 from nerfdiff.results.row import ResultRow
 from nerfdiff.sweeps.jobs import Group, Job, Labels, counterpart
 from nerfdiff.utils.errors import DataError
 
-FRECHET = ("fid", "fd_st_vgg")  # one number for all scenes of a run
 PER_RUN = (*FRECHET, "distill_s", "scene_s")
-PER_SCENE = (*IMAGE_METRICS, *SCENE_METRICS)
-LARGEST = 2**21  # bytes of a file of scores: of some 10,000 scenes
 
 SceneValues = dict[str, float]
 
@@ -116,24 +111,6 @@ def over_seeds(jobs: Sequence[Job]) -> dict[str, SceneValues]:
         if common:
             values[metric] = {scene: mean_of([seed[metric][scene] for seed in read]) for scene in common}
     return values
-
-
-def read_scores(path: Path) -> dict[str, dict[str, float]]:
-    """What was measured of each scene: values by metric.
-
-    Raises:
-        DataError: the file is missing or damaged.
-    """
-    try:
-        if (size := path.stat().st_size) > LARGEST or not path.is_file():
-            raise ValueError(f"{size} bytes are too many" if path.is_file() else "no file")
-        with open(path, newline="", encoding="utf-8") as file:
-            return {
-                line["scene"]: {name: float(line[name]) for name in PER_SCENE if line.get(name)}
-                for line in csv.DictReader(file)
-            }
-    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-        raise DataError(f"{path}: cannot be read ({error})") from error
 
 
 def _by_metric(scores: Mapping[str, Mapping[str, float]]) -> dict[str, SceneValues]:

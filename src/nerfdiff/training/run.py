@@ -11,7 +11,7 @@ import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from lightning import Trainer, seed_everything
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nerfdiff.checkpoint import (
     DAMAGED,
@@ -36,6 +36,7 @@ from nerfdiff.training.callbacks.checkpoint import ClearCheckpointIO
 from nerfdiff.training.callbacks.record import Record
 from nerfdiff.training.memory import WEIGHTS_ADAM_EMA, is_tight, within_memory
 from nerfdiff.training.module import NerfDiffModule
+from nerfdiff.utils.config import auto_precision, plain
 from nerfdiff.utils.errors import CheckpointError, ConfigError, ProcessLost, TrainingDiverged
 from nerfdiff.utils.files import held, remove_leftovers
 from nerfdiff.utils.hashes import sha256_file, sha256_values
@@ -177,17 +178,6 @@ def build_trainer(cfg: DictConfig) -> Trainer:
         )
     except InstantiationException as error:
         raise ConfigError(f"the trainer cannot be set up: {error.__cause__ or error}") from error
-
-
-def auto_precision(accelerator: str) -> str:
-    """`bf16-mixed` where a GPU will be used that computes in bf16, else `32-true`."""
-    on_gpu = accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available()
-    return "bf16-mixed" if on_gpu and torch.cuda.is_bf16_supported(including_emulation=False) else "32-true"
-
-
-def plain(node: Any) -> Any:
-    """A config node as dicts and lists, interpolations resolved: what a checkpoint can hold."""
-    return OmegaConf.to_container(node, resolve=True)
 
 
 def _checkpoint_to_resume(output_dir: Path, cfg: DictConfig, model_config: dict, data: SceneDataModule) -> Path | None:

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from nerfdiff.poses import look_at_origin
 from procedural.clevr.objects import ClevrObject
 from procedural.mesh import box
 from procedural.mitsuba_model import rgb
-from procedural.poses import look_at_origin
 
 FLOOR = (0.52, 0.52, 0.51)
 # CLEVR's key, fill and back lamps, moved outwards along their own directions until no camera that looks down

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float, UInt16
 from PIL import Image
 
+from nerfdiff.poses import look_at_origin
 from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.files import settle
 from procedural.clevr.metadata import SLOTS, facts_path, scene_facts, write_metadata
@@ -26,7 +27,6 @@ from procedural.clevr.world import LAMPS, ClevrWorld
 from procedural.colour import linear_to_srgb8
 from procedural.kinds.kind import SceneJob, ascending, check_splits, stream
 from procedural.mitsuba_renderer import Film, MitsubaRenderer
-from procedural.poses import look_at_origin
 from procedural.root_folder import half_written
 
 VIEWS = 3

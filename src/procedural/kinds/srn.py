@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from nerfdiff.poses import SPIRAL_VIEWS, srn_spiral
 from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.files import publish
 from procedural.car_proportions import STYLES as CAR_STYLES
@@ -31,7 +32,7 @@ from procedural.kinds.kind import SceneJob, ascending, check_splits, check_style
 from procedural.mesh import Model
 from procedural.mitsuba_model import ModelWorld
 from procedural.mitsuba_renderer import Film, MitsubaRenderer
-from procedural.poses import FOCAL_PER_PIXEL, SPIRAL_VIEWS, random_sphere, srn_spiral
+from procedural.poses import FOCAL_PER_PIXEL, random_sphere
 from procedural.root_folder import half_written
 
 SPLITS = ("train", "val", "test")

@@ -4,7 +4,8 @@ import torch
 from lightning import LightningModule, Trainer
 from torch.utils.data import DataLoader
 
-from nerfdiff.training.callbacks.snapshots import Snapshots, average_of, combination, exponent_of, products
+from nerfdiff.averages import average_of, combination, exponent_of, products
+from nerfdiff.training.callbacks.snapshots import Snapshots
 from nerfdiff.utils.errors import CheckpointError, ConfigError
 
 

@@ -22,6 +22,7 @@ from nerfdiff.data.formats.posed_files import ASPECT_TOLERANCE
 from nerfdiff.data.readers.framing import Framing, stack_pixels
 from nerfdiff.data.readers.index import folder_stamp
 from nerfdiff.data.scene import Listing, MissingSplit, Scene
+from nerfdiff.poses import look_at_origin
 from nerfdiff.utils.errors import ConfigError, DataError, some
 
 PARENTS = ("", "clevr3d")
@@ -127,7 +128,7 @@ class Clevr3DReader:
         files = {
             name: [self._image(scene, name), *(self._truth_file(kind, scene, name) for kind in truth)] for name in names
         }
-        return Listing(np.stack([_looking_at_origin(position) for position in self.positions[index]]), files)
+        return Listing(np.stack([look_at_origin(position) for position in self.positions[index]]), files)
 
     def load(self, index: int, views: Sequence[int] | None = None, truth: bool = False) -> Scene:
         scene, names = self.scene_id(index), self.view_names(index)
@@ -137,7 +138,7 @@ class Clevr3DReader:
         sizes = [image.shape[:2] for image in stored]
         K = [self._K(file, *size) for file, size in zip(files, sizes, strict=True)]
         pixels = stack_pixels([self.framing.image(image) for image in stored], files)
-        c2w = np.stack([_looking_at_origin(self.positions[index, view]) for view in numbers])
+        c2w = np.stack([look_at_origin(self.positions[index, view]) for view in numbers])
         framed_K = np.stack([self.framing.K(k, *size) for k, size in zip(K, sizes, strict=True)])
         return Scene(
             id=scene,
@@ -243,15 +244,6 @@ def _look_at_able(
             "expected finite positions off the z axis, from which a camera can look at the origin with z up"
         )
     return positions
-
-
-def _looking_at_origin(position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    """Camera-to-world with OpenCV axes, level, looking at the origin."""
-    centre = position.astype(np.float64)
-    z = -centre / np.linalg.norm(centre)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    return np.vstack([np.stack([x, np.cross(z, x), z, centre], axis=1), [0, 0, 0, 1]])
 
 
 def _z_depth(file: Path, levels: np.ndarray, K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "height width"]:

@@ -26,9 +26,9 @@ from nerfdiff.limits import check_limit, check_limits
 from nerfdiff.noise import quieten
 from nerfdiff.quoting import parse_override, quote_values
 from nerfdiff.stopping import Stopped, leave, on_signals, stop
-from nerfdiff.utils.cpu_memory import keep_freed_memory
 from nerfdiff.utils.errors import ConfigError, UserError, is_out_of_memory
 from nerfdiff.utils.hashes import sha256_values
+from nerfdiff.utils.memory import keep_freed_memory
 
 # What a value must be, by the type of its default.
 KINDS: dict[type, tuple[str, tuple[type, ...]]] = {

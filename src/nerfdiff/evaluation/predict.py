@@ -23,8 +23,8 @@ from nerfdiff.metrics.image import psnr
 from nerfdiff.metrics.predictions import SCENE, PredictionWriter
 from nerfdiff.results.pictures import orbit_video
 from nerfdiff.trajectories import orbit
-from nerfdiff.utils.cpu_memory import peak_memory
 from nerfdiff.utils.errors import ConfigError, TimeUp, some
+from nerfdiff.utils.memory import peak_memory
 from nerfdiff.utils.timing import PartClock, Stopwatch
 
 ORBIT = "orbit.mp4"

@@ -11,8 +11,8 @@ from torch import Tensor
 from nerfdiff.fit.ray_batches import RayBatches
 from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.render.renderer import Renderer
-from nerfdiff.training.memory import free_memory
 from nerfdiff.utils.errors import OutOfMemory, size_text
+from nerfdiff.utils.memory import free_memory
 
 log = logging.getLogger(__name__)
 

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-import psutil
 import torch
 import torch.nn.functional as F
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -17,6 +16,7 @@ from nerfdiff.cameras import Cameras
 from nerfdiff.diffusion.unet import AUTO
 from nerfdiff.model import NerfDiff, build_on_meta
 from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.memory import free_memory
 
 log = logging.getLogger(__name__)
 
@@ -256,8 +256,3 @@ def within_memory(
         )
     log.info("%s", f"{told} (model.unet.checkpointing={choice})" if automatic else told)
     return settled
-
-
-def free_memory(device: torch.device) -> int:
-    """Bytes that a new process could take on `device` now."""
-    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else psutil.virtual_memory().available

@@ -1,9 +1,15 @@
-"""Freed memory stays with the process, for the next tensors."""
+"""How much memory there is, was taken at most, and that what is freed stays with the process for the next tensors.
+
+PyTorch is imported where it is needed: every command imports this module.
+"""
 
 import ctypes
 import resource
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
+
+import psutil
 
 # of <malloc.h>
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
@@ -43,3 +49,10 @@ def peak_memory() -> int:
         return 1024 * int(next(line for line in lines if line.startswith("VmHWM:")).split()[1])
     # counts the process that started this one as well
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def free_memory(device: Any) -> int:
+    """Bytes that a new process could take now on `device`, a `torch.device`."""
+    import torch
+
+    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else psutil.virtual_memory().available

@@ -6,7 +6,7 @@ import pytest
 
 FAULTS = """
 import resource
-from nerfdiff.utils.cpu_memory import keep_freed_memory
+from nerfdiff.utils.memory import keep_freed_memory
 faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 {call}
 bytearray(2**24)  # the first block is new in any case

@@ -10,7 +10,7 @@ from lightning import Callback
 
 from data_fixtures import write_scene
 from nerfdiff.cli import load_config
-from nerfdiff.training.run import run as training
+from nerfdiff.training import run as training
 from nerfdiff.training.run import train
 
 SRC = Path(__file__).parents[1] / "src"

@@ -72,10 +72,13 @@ def resolve_variant(variant: str) -> str:
     """`auto` becomes `cuda_ad_rgb` where Mitsuba finds a CUDA device, else `scalar_rgb`.
 
     Raises:
-        ConfigError: this Mitsuba has no such variant.
+        ConfigError: this Mitsuba has no such variant, or there is no Mitsuba.
     """
-    import drjit
-    import mitsuba
+    try:
+        import drjit
+        import mitsuba
+    except ModuleNotFoundError as error:
+        raise ConfigError('rendering scenes needs Mitsuba: pip install "nerfdiff[scenes]"') from error
 
     if variant == "auto":
         return "cuda_ad_rgb" if drjit.has_backend(drjit.JitBackend.CUDA) else "scalar_rgb"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 from PIL import Image
-from scenes.closed_surface import assert_closed
+from closed_surface import assert_closed
 
 from nerfdiff.utils.errors import ConfigError
 from procedural.clevr.objects import COLOURS, place_objects

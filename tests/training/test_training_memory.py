@@ -7,8 +7,8 @@ import torch
 
 from model_fixtures import config
 from nerfdiff.model import build_on_meta
+from nerfdiff.training import memory
 from nerfdiff.training.memory import HEADROOM, PeakMemory, TrainingMemory, is_tight, training_memory, within_memory
-from nerfdiff.training.run import memory
 from nerfdiff.utils.errors import ConfigError
 
 

@@ -215,9 +215,10 @@ def test_a_run_goes_on_with_what_it_began_with(data, tmp_path):
 
 
 def test_averages_are_of_the_model_they_are_exported_with(data, tmp_path):
-    settings = "{_target_: nerfdiff.training.callbacks.snapshots.Snapshots, folder: %s, every_n_steps: 1, lengths: [0.05, 0.1]}"
     run = tmp_path / "run"
-    run_training(data, run, f"callbacks.snapshots={settings % (run / 'snapshots')}")
+    settings = f"folder: {run / 'snapshots'}, every_n_steps: 1, lengths: [0.05, 0.1]"
+    snapshots = "nerfdiff.training.callbacks.snapshots.Snapshots"
+    run_training(data, run, f"callbacks.snapshots={{_target_: {snapshots}, {settings}}}")
     export(run, "ema", tmp_path / "out", "float32", None, average=0.1)
     made, expected = load_model(tmp_path / "out", "ema"), average_of(run / "snapshots", 0.1)
     assert made.trained_on[-1]["average"] == 0.1

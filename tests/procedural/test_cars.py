@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-from closed_surface import assert_closed
 
+from closed_surface import assert_closed
 from procedural.car_proportions import STYLES
 from procedural.cars import build_car
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-from closed_surface import assert_closed
 
+from closed_surface import assert_closed
 from procedural.chairs import STYLES, build_chair
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 from PIL import Image
-from closed_surface import assert_closed
 
+from closed_surface import assert_closed
 from nerfdiff.utils.errors import ConfigError
 from procedural.clevr.objects import COLOURS, place_objects
 from procedural.clevr.world import rounded_cylinder

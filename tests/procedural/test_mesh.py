@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-from closed_surface import assert_closed
 
+from closed_surface import assert_closed
 from procedural import mesh
 
 GREY = (0.5, 0.5, 0.5)

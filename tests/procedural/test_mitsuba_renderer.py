@@ -1,3 +1,4 @@
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -170,6 +171,13 @@ def test_srgb_conversion_against_known_values_and_its_own_inverse():
 def test_an_unknown_variant_is_refused_with_the_known_ones():
     with pytest.raises(ConfigError, match="scalar_rgb"):
         resolve_variant("opengl")
+
+
+@pytest.mark.parametrize("missing", ["mitsuba", "drjit"])
+def test_without_mitsuba_the_message_says_what_installs_it(missing, monkeypatch):
+    monkeypatch.setitem(sys.modules, missing, None)  # importing it fails
+    with pytest.raises(ConfigError, match=r'pip install "nerfdiff\[scenes\]"'):
+        resolve_variant("auto")
 
 
 def test_rgba_holds_straight_colours_that_composite_to_the_image_on_white():

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-from closed_surface import assert_closed
 
+from closed_surface import assert_closed
 from procedural.products.catalogue import STYLES, build_product
 from procedural.texture import PATTERNS, SIDE, Texture, box_coordinates
 

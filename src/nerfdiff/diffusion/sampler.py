@@ -20,7 +20,7 @@ Images = Float[Tensor, "batch 3 height width"]
 
 
 def ddim_step(z: Images, x0: Images, t: Tensor, t_next: Tensor, eta: float, noise: Images | None) -> Images:
-    """One step from Z_t to Z_{t_next} given the denoised x0 (DDIM eq. 12 and 16).
+    """One step from Z_t to Z_{t_next} given the denoised x0 (Song et al. 2020, DDIM, eq. 12 and 16).
 
     Args:
         t, t_next: scalars, t > t_next.

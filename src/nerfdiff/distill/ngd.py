@@ -19,7 +19,11 @@ COMPARISONS = ("current", "last")
 
 @dataclass(frozen=True)
 class Guidance:
-    """How strongly views are drawn towards the field's renderings at each t.
+    """NeRF guidance (paper, eq. "eps_guide"): how strongly denoised images are drawn to the field's renderings at each t.
+
+    ε̃ = ε + γ (σ/α) (I − I_θ) is x̃0 = x0 − w (I − I_θ) with w = γ σ²/α²: for I = x0, a blend of x0 and the rendering.
+    For w > 1 that overshoots and for w > 2 it diverges, and σ²/α² grows without bound as t → 1; so w is clamped to
+    [0, 1], whose upper end is the remark of the paper that γ = SNR replaces the denoised images by the renderings.
 
     Args:
         schedule: `snr` is the paper's w = γ σ²/α²; `constant` is w = γ; `linear` is w = γ t.

@@ -17,6 +17,10 @@ from nerfdiff.poses import SPIRAL_VIEWS, srn_spiral
 from nerfdiff.trajectories import look_at, look_at_point
 from nerfdiff.utils.errors import ConfigError, DataError
 
+log = logging.getLogger(__name__)
+IN_SIGHT = 0.9
+"""Least cosine between the input camera's axis and the direction of what all look at."""
+
 
 @runtime_checkable
 class Prior(Protocol):
@@ -83,9 +87,6 @@ def plane_normal(cameras: Cameras) -> Float[Tensor, "3"]:
     normal = axes[-1].to(cameras.c2w)
     # in the upper half-space cameras look down: their directions are against up
     return torch.where((cameras.c2w[:, :3, 2] @ normal).mean() > 0, -normal, normal)
-
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -167,10 +168,6 @@ class Sphere:
         across = turn.cos()[:, None] * front + turn.sin()[:, None] * torch.linalg.cross(up, front)
         arms = height[:, None] * up + (1 - height**2).sqrt()[:, None] * across
         return with_source_lens(look_at(middle + radius * arms, middle, up), scene)
-
-
-IN_SIGHT = 0.9
-"""Least cosine between the input camera's axis and the direction of what all look at."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Where to look along a ray: uniform bins, then importance samples from what the bins showed."""
+"""Quadrature along a ray: uniform bins, importance samples from what they showed, and the weights of the integral."""
 
 import torch
 from jaxtyping import Float
@@ -14,7 +14,7 @@ KEPT = torch.float16
 def compositing_weights(
     density: Float[Tensor, "*rays samples"], lengths: Float[Tensor, "*rays samples"]
 ) -> Float[Tensor, "*rays samples"]:
-    """ω_i = T_i (1 − exp(−σ_i δ_i)), T_i = exp(−Σ_{j<i} σ_j δ_j).
+    """ω_i = T_i (1 − exp(−σ_i δ_i)), T_i = exp(−Σ_{j<i} σ_j δ_j) (paper, eq. "nerf").
 
     fp32 throughout, with T as the exponential of an exclusive cumulative sum: a bf16 cumulative product of many
     nearly transparent samples stays at 1.

@@ -1,4 +1,4 @@
-"""Config nodes and values to what other code takes."""
+"""From values of a config to what other code takes."""
 
 from typing import Any
 

@@ -16,6 +16,8 @@ import psutil
 
 from nerfdiff.utils.errors import BusyError, DataError
 
+NONFINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
+
 
 @contextmanager
 def atomic(path: Path, former: Path | None = None) -> Iterator[Path]:
@@ -164,9 +166,6 @@ def _sync(path: Path) -> None:
             raise
     finally:
         os.close(file)
-
-
-NONFINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
 
 def encode(value: Any) -> Any:

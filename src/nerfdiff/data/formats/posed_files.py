@@ -1,4 +1,4 @@
-"""Poses and intrinsics in text files, checked as they are read."""
+"""Poses and intrinsics in text files, and what every reader asks of them, wherever they were written."""
 
 import codecs
 import stat
@@ -15,6 +15,10 @@ MAX_POSITION = 1e12
 """Coordinates whose powers single precision still holds."""
 UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 """Of a file that Windows PowerShell wrote, say."""
+ASPECT_TOLERANCE = 0.02
+"""How far the two scale factors may differ by rounding of the image size (640×480 stored as 107×80)."""
+FOCAL_RANGE = (1e-3, 1e5)
+"""Of focal lengths relative to the image's width: fields of view of 179.9° and of 2 seconds of arc."""
 
 
 def read_numbers(path: Path, counts: tuple[int, ...], what: str) -> Float[np.ndarray, " count"]:
@@ -108,12 +112,6 @@ def inverse_pose(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     inverse[:3, :3] = pose[:3, :3].T
     inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
     return inverse
-
-
-ASPECT_TOLERANCE = 0.02
-"""How far the two scale factors may differ by rounding of the image size (640×480 stored as 107×80)."""
-FOCAL_RANGE = (1e-3, 1e5)
-"""Of focal lengths relative to the image's width: fields of view of 179.9° and of 2 seconds of arc."""
 
 
 def is_focal(f: float, width: float) -> bool:

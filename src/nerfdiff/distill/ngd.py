@@ -19,7 +19,7 @@ COMPARISONS = ("current", "last")
 
 @dataclass(frozen=True)
 class Guidance:
-    """NeRF guidance (paper, eq. "eps_guide"): how strongly denoised images are drawn to the field's renderings at each t.
+    """NeRF guidance (paper, eq. "eps_guide"): how strongly denoised images are drawn to the field's renderings.
 
     ε̃ = ε + γ (σ/α) (I − I_θ) is x̃0 = x0 − w (I − I_θ) with w = γ σ²/α²: for I = x0, a blend of x0 and the rendering.
     For w > 1 that overshoots and for w > 2 it diverges, and σ²/α² grows without bound as t → 1; so w is clamped to

@@ -30,7 +30,7 @@ from nerfdiff.data.readers.abo_renders import ABORenders
 from nerfdiff.data.scene import MissingSplit, SceneReader
 from nerfdiff.utils.errors import ConfigError, DataError
 
-CONF = str(Path(__file__).parents[2] / "conf")
+CONF = str(Path(__file__).parents[3] / "conf")
 SETTINGS = {
     "split": "train",
     "near": 3.2,

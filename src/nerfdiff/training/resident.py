@@ -1,0 +1,396 @@
+"""Training with all images on the device and one CUDA graph per step.
+
+A small model's step on a GPU takes as long as the host needs to start its kernels. Here nothing is asked of the host:
+draws, noise and times are made on the device, so a step is one graph that is replayed. On a CPU the same steps run one
+by one. The loss is `NerfDiffModule`'s; what is left out is what a run of minutes can do without: resuming,
+validation, previews (evaluate.py does these afterwards, on the snapshots too).
+"""
+
+import logging
+import math
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from hydra.utils import instantiate
+from jaxtyping import Float, Int64, UInt8
+from omegaconf import DictConfig
+from safetensors.torch import save_file
+from torch import Tensor
+from torch.nn.utils import clip_grad_norm_
+from torch.utils.tensorboard import SummaryWriter
+
+from nerfdiff.averages import exponent_of
+from nerfdiff.cameras import Cameras
+from nerfdiff.checkpoint import LoadedModel, export_model, load_model
+from nerfdiff.data.cache import CachedReader
+from nerfdiff.data.scene import SceneReader
+from nerfdiff.data.views import spread
+from nerfdiff.diffusion.denoiser import Condition
+from nerfdiff.diffusion.schedule import add_noise, alpha_sigma, expand, v_from_x0_eps
+from nerfdiff.model import NerfDiff
+from nerfdiff.results.environment import git_state
+from nerfdiff.training.run import plain
+from nerfdiff.utils.errors import ConfigError, DataError, TrainingDiverged
+from nerfdiff.utils.files import atomic
+from nerfdiff.utils.randomness import seed_of, spread_times
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ResidentScenes:
+    """All views of scenes that have as many views each, on one device.
+
+    Args:
+        pixels: 8-bit colours.
+        c2w, K: as `Cameras` has them.
+        near, far: bounds of each scene, as distances along rays.
+    """
+
+    pixels: UInt8[Tensor, "scenes views 3 height width"]
+    c2w: Float[Tensor, "scenes views 4 4"]
+    K: Float[Tensor, "scenes views 3 3"]
+    near: Float[Tensor, "scenes"]
+    far: Float[Tensor, "scenes"]
+
+    @staticmethod
+    def read(reader: SceneReader, wanted: int | None, device: torch.device) -> "ResidentScenes":
+        """Scenes spread evenly over a reader.
+
+        Raises:
+            DataError: they have different numbers of views.
+        """
+        scenes = [reader.load(index) for index in spread(len(reader), wanted)]
+        if len(counts := {len(scene.views) for scene in scenes}) > 1:
+            raise DataError(f"training from memory needs scenes of equally many views, and these have {sorted(counts)}")
+        bounds = torch.tensor([[scene.near, scene.far] for scene in scenes], device=device).unbind(1)
+        pixels = torch.stack([scene.pixels for scene in scenes]).to(device)
+        cameras = Cameras.stack([scene.cameras for scene in scenes]).to(device)
+        return ResidentScenes(pixels, cameras.c2w, cameras.K, *bounds)
+
+    def images(self, scene: Int64[Tensor, "*n"], view: Int64[Tensor, "*n"]) -> Float[Tensor, "*n 3 height width"]:
+        """Colours in [0, 1]."""
+        return self.pixels[scene, view].float() / 255
+
+    def cameras(
+        self, scene: Int64[Tensor, "n"], source: Int64[Tensor, "n"], targets: Int64[Tensor, "n t"]
+    ) -> tuple[Cameras, Cameras]:
+        """The sources' cameras [n], and the targets' [n, t] in their space."""
+        size = self.pixels.shape[-2:]
+        sources = Cameras(self.c2w[scene, source], self.K[scene, source], *size)
+        rows = scene[:, None].expand_as(targets)
+        relative = Cameras(self.c2w[rows, targets], self.K[rows, targets], *size).relative_to(sources[:, None])
+        identity = torch.zeros_like(sources.c2w)
+        identity.diagonal(dim1=-2, dim2=-1).fill_(1)
+        return replace(sources, c2w=identity), relative
+
+
+def draw_table(
+    seed: int, draws: int, scenes: int, views: int, targets: int, sources: int, source_as_target: float
+) -> Int64[Tensor, "draws columns"]:
+    """Scene, source view and target views of each draw, by the rule of `nerfdiff.data.draws.Draws`.
+
+    Raises:
+        ConfigError: a scene has too few views.
+    """
+    if views <= targets:
+        raise ConfigError(f"data.target_views={targets} and a source need scenes of more than {views} views")
+    rng = torch.Generator().manual_seed(seed_of(seed, "resident draws"))
+    passes = [torch.randperm(scenes, generator=rng) for _ in range(math.ceil(draws / scenes))]
+    source = torch.randint(min(sources, views), (draws, 1), generator=rng)
+    order = torch.rand(draws, views, generator=rng).scatter(1, source, 2.0).argsort(1)[:, :targets]
+    again = torch.rand(draws, generator=rng) < source_as_target
+    order[:, 0] = torch.where(again, source[:, 0], order[:, 0])
+    return torch.cat([torch.cat(passes)[:draws, None], source, order], 1)
+
+
+class FrozenField:
+    """Renderings of all views from some source views of each scene, and what the CDM attends to, made once.
+
+    Args:
+        sources: so many first views of a scene.
+        batch: source views encoded at once.
+        autocast: the context of the forward pass.
+    """
+
+    @torch.no_grad()
+    def __init__(
+        self, model: NerfDiff, scenes: ResidentScenes, sources: int, batch: int, autocast: AbstractContextManager
+    ):
+        count, views = scenes.pixels.shape[:2]
+        device = scenes.pixels.device
+        pairs = torch.cartesian_prod(torch.arange(count), torch.arange(min(sources, views))).to(device)
+        everything = torch.arange(views, device=device)
+        rendered, context = [], []
+        for scene, source in (part.unbind(1) for part in pairs.split(batch)):
+            own, all_views = scenes.cameras(scene, source, everything.expand(len(scene), -1))
+            with autocast:
+                encoding = model.encode(scenes.images(scene, source), own, scenes.near[scene], scenes.far[scene])
+                rendered.append(model.render(encoding, all_views).rgb.movedim(-1, 2).half())
+            context.append([level.to(torch.bfloat16) for level in encoding.context])
+        shape = (count, min(sources, views))
+        self.rendered = torch.cat(rendered).unflatten(0, shape)
+        self.context = [torch.cat(level).unflatten(0, shape) for level in zip(*context, strict=True)]
+
+
+class Step:
+    """One optimizer step; `run` makes it, and on a GPU replays it.
+
+    Args:
+        table: draws, `batch` of them a step.
+        frozen: what a field that is not trained shows; None trains field and CDM together.
+        optimizer: AdamW's `lr`, `weight_decay` and `betas`.
+        clip: largest norm of the gradient.
+        autocast: the context of the forward pass.
+    """
+
+    def __init__(
+        self,
+        model: NerfDiff,
+        scenes: ResidentScenes,
+        table: Int64[Tensor, "draws columns"],
+        batch: int,
+        frozen: FrozenField | None,
+        optimizer: Mapping,
+        clip: float,
+        seed: int,
+        autocast: AbstractContextManager,
+    ):
+        self.model, self.scenes, self.frozen, self.seed = model, scenes, frozen, seed
+        self.clip, self.autocast = clip, autocast
+        device = scenes.pixels.device
+        self.table = table.to(device).view(-1, batch, table.shape[1])
+        self.number = torch.zeros(1, dtype=torch.int64, device=device)
+        self.lr = torch.tensor(float(optimizer["lr"]), device=device)
+        self.trained = [p for p in model.parameters() if p.requires_grad]
+        cuda = device.type == "cuda"
+        self.optimizer = torch.optim.AdamW(
+            self.trained,
+            lr=self.lr if cuda else float(optimizer["lr"]),
+            weight_decay=optimizer["weight_decay"],
+            betas=tuple(optimizer["betas"]),
+            fused=cuda,
+            capturable=cuda,
+        )
+        self.losses = {name: torch.zeros((), device=device) for name in ("loss_dm", "loss_ic")}
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def capture(self, warm_up: int = 3) -> None:
+        """Record the step, after some that are made one by one; they count as steps."""
+        side = torch.cuda.Stream()
+        side.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(side):
+            for _ in range(warm_up):
+                self._step()
+        torch.cuda.current_stream().wait_stream(side)
+        self.optimizer.zero_grad(set_to_none=True)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            self._step(clear=False)
+        self._graph = graph
+
+    def run(self, lr: float) -> None:
+        if self.lr.is_cuda:
+            self.lr.fill_(lr)
+        else:
+            self.optimizer.param_groups[0]["lr"] = lr
+        if self._graph is None:
+            self._step()
+        else:
+            self._graph.replay()
+
+    def _step(self, clear: bool = True) -> None:
+        if clear:
+            self.optimizer.zero_grad(set_to_none=True)
+        with self.autocast:
+            losses = self._losses(self.table[self.number][0])
+        sum(losses.values()).backward()
+        clip_grad_norm_(self.trained, self.clip, foreach=True)
+        self.optimizer.step()
+        for name, value in losses.items():
+            self.losses[name].copy_(value.detach())
+        self.number.add_(1).remainder_(len(self.table))
+
+    def _losses(self, rows: Int64[Tensor, "batch columns"]) -> dict[str, Tensor]:
+        """L^DM, and L^IC where the field is trained (paper, "Training phase")."""
+        scene, source, targets = rows[:, 0], rows[:, 1], rows[:, 2:]
+        scenes, model = self.scenes, self.model
+        truth = scenes.images(scene[:, None].expand_as(targets), targets)
+        own, relative = scenes.cameras(scene, source, targets)
+        losses = {}
+        if self.frozen is None:
+            encoding = model.encode(scenes.images(scene, source), own, scenes.near[scene], scenes.far[scene])
+            rays = math.prod(targets.shape[1:]) * math.prod(truth.shape[-2:])
+            jitter = torch.rand(len(rows), rays, model.renderer.samples_per_ray, device=truth.device)
+            rendered = model.render(encoding, relative, jitter).rgb.movedim(-1, 2)
+            losses["loss_ic"] = F.mse_loss(rendered, truth)
+            condition = model.condition(encoding, relative, rendered)
+        else:
+            every = targets.shape[1]
+            condition = Condition(
+                rendered=self.frozen.rendered[scene[:, None], source[:, None], targets].float().flatten(0, 1),
+                source=scenes.images(scene, source)[:, None].expand_as(truth).flatten(0, 1),
+                cameras=relative.flatten(),
+                near=scenes.near[scene].repeat_interleave(every),
+                context=[level[scene, source] for level in self.frozen.context],
+            )
+        x0 = 2 * truth.flatten(0, 1) - 1
+        eps = torch.randn_like(x0)
+        t = spread_times(self.number * len(x0) + torch.arange(len(x0), device=x0.device), self.seed)
+        alpha, sigma = (expand(c, x0) for c in alpha_sigma(t))
+        predicted = model.denoiser.velocity(add_noise(x0, eps, alpha, sigma), t, condition)
+        return losses | {"loss_dm": F.mse_loss(predicted, v_from_x0_eps(x0, eps, alpha, sigma))}
+
+
+class Averages:
+    """Power-function averages of a model's weights (`nerfdiff.averages`), and their files."""
+
+    def __init__(self, model: NerfDiff, lengths: list[float]):
+        self.model = model
+        self.exponents = {length: exponent_of(length) for length in lengths}
+        self.current = [p.detach() for p in model.parameters()]
+        self.values = {length: [p.clone() for p in self.current] for length in lengths}
+
+    @torch.no_grad()
+    def update(self, step: int) -> None:
+        for length, exponent in self.exponents.items():
+            torch._foreach_lerp_(self.values[length], self.current, 1 - (1 - 1 / step) ** (exponent + 1))
+
+    def save(self, folder: Path, step: int) -> None:
+        for length, values in self.values.items():
+            names = [name for name, _ in self.model.named_parameters()]
+            state = {n: v.to("cpu", torch.float16).contiguous() for n, v in zip(names, values, strict=True)}
+            with atomic(folder / f"step_{step:07d}_{length}.safetensors") as temporary:
+                save_file(state, temporary, {"step": str(step), "length": str(length)})
+
+    @torch.no_grad()
+    def load_into(self, model: NerfDiff, length: float) -> None:
+        for parameter, value in zip(model.parameters(), self.values[length], strict=True):
+            parameter.copy_(value)
+
+
+def train_resident(cfg: DictConfig) -> Path:
+    """Train for `cfg.minutes` or `cfg.steps`, whichever ends first, from `cfg.init`.
+
+    Returns:
+        the exported weights: the average of `cfg.average`.
+
+    Raises:
+        UserError: data, config or checkpoint that do not fit, or weights that are no longer finite.
+    """
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    begun = load_model(cfg.init, "ema", cfg.paths.assets_dir)
+    model = _model(cfg, begun).to(device).train()
+    data = instantiate(cfg.data)
+    reader = data.reader("train")
+    if data.cache:
+        reader = CachedReader(reader, data.cache_dir, f"{data.name}_{data.splits['train']}")
+    scenes = ResidentScenes.read(reader, data.train_scenes, device)
+    count, views, _, *size = scenes.pixels.shape
+    log.info("%d scenes of %d views of %dx%d pixels on %s", count, views, *size, device)
+    sources = data.train_source_views or views
+    table = draw_table(
+        seed=cfg.seed,
+        draws=min(cfg.steps, cfg.table) * data.batch_size,
+        scenes=count,
+        views=views,
+        targets=data.target_views,
+        sources=sources,
+        source_as_target=data.source_as_target,
+    )
+    autocast = torch.autocast(device.type, torch.bfloat16, enabled=cfg.precision == "bf16-mixed", cache_enabled=False)
+    frozen = None
+    if cfg.part == "cdm":
+        model.encoder.requires_grad_(False)
+        model.decoder.requires_grad_(False)
+        began = time.monotonic()
+        frozen = FrozenField(model, scenes, sources, cfg.encoded_at_once, autocast)
+        log.info("%d renderings kept, %.1f s", frozen.rendered[..., 0, 0, 0].numel(), time.monotonic() - began)
+    step = Step(
+        model, scenes, table, data.batch_size, frozen, plain(cfg.optimizer), cfg.gradient_clip_val, cfg.seed, autocast
+    )
+    averages = Averages(model, list(cfg.lengths))
+    taken = _train(cfg, step, averages)
+    averages.load_into(model, cfg.average)
+    seen = {
+        "part": "CDM" if cfg.part == "cdm" else "field and the CDM",
+        "images": taken * data.batch_size * data.target_views,
+        "dataset": data.name,
+        "scenes": count,
+        "about": data.about,
+        "git_sha": git_state(Path(__file__).parent)["git_sha"],
+        "average": cfg.average,
+    }
+    loaded = replace(
+        begun,
+        model=model.cpu().eval(),
+        config=dict(begun.config) | {"conditioning": plain(cfg.conditioning)},
+        image_size=list(size),
+        stability={},
+        trained_on=[*begun.trained_on, seen],
+    )
+    return export_model(loaded, Path(cfg.paths.output_dir) / "model", torch.float32)
+
+
+def _model(cfg: DictConfig, begun: LoadedModel) -> NerfDiff:
+    """A model of the sizes of `init`, with its field, and with its CDM unless that is to begin afresh."""
+    if cfg.part not in ("cdm", "joint"):
+        raise ConfigError(f"part={cfg.part}: choose cdm (the field stays as it is) or joint")
+    torch.manual_seed(cfg.seed)
+    model = NerfDiff(**(dict(begun.config) | {"conditioning": plain(cfg.conditioning)}))
+    kept = begun.model.state_dict()
+    if cfg.fresh_cdm:
+        kept = {name: value for name, value in kept.items() if not name.startswith("denoiser.")}
+    missing = model.load_state_dict(kept, strict=False).missing_keys
+    if any(not name.startswith("denoiser.") for name in missing) or (missing and not cfg.fresh_cdm):
+        raise ConfigError(f"init={cfg.init} lacks {missing[0]}; set fresh_cdm=true to begin with a new CDM")
+    model.renderer = replace(model.renderer, backend=cfg.backend)
+    if cfg.channels_last:
+        model.to(memory_format=torch.channels_last)
+    return model
+
+
+def _train(cfg: DictConfig, step: Step, averages: Averages) -> int:
+    """Returns the number of steps."""
+    options, output = plain(cfg.optimizer), Path(cfg.paths.output_dir)
+    cuda = step.number.is_cuda
+    marks = _marks(sorted(cfg.snapshots), cfg)
+    taken, mark = 0, next(marks)
+    began = said = time.monotonic()
+    with SummaryWriter(output / "tensorboard") as curves:
+        while True:
+            done = max(taken / cfg.steps, (time.monotonic() - began) / (60 * cfg.minutes))
+            if done >= mark:
+                averages.save(output / "snapshots", taken)
+                mark = next(marks, math.inf)
+            if done >= 1:
+                break
+            fall = 0.5 * (1 + math.cos(math.pi * done)) if options["decay"] == "cosine" else 1.0
+            step.run(options["lr"] * fall * min(1.0, (taken + 1) / max(1, options["warmup_steps"])))
+            taken += 1
+            averages.update(taken)
+            if cuda and taken == cfg.eager_steps:
+                step.capture()
+                taken += 3
+            if taken % cfg.log_every_n_steps == 0:  # reading the losses waits for the device, so steps do not pile up
+                losses = {name: value.item() for name, value in step.losses.items()}
+                if not all(map(math.isfinite, losses.values())):
+                    raise TrainingDiverged(f"step {taken}: the loss is not finite; lower optimizer.lr")
+                for name, value in losses.items():
+                    curves.add_scalar(f"train/{name}", value, taken)
+                if (now := time.monotonic()) - said > cfg.every_seconds or taken == cfg.log_every_n_steps:
+                    words = ", ".join(f"{name} {value:.4f}" for name, value in losses.items())
+                    log.info("step %d, %s, %.1f steps/s, %.0f %% done", taken, words, taken / (now - began), 100 * done)
+                    said = now
+    return taken
+
+
+def _marks(shares: list[float], cfg: DictConfig) -> Iterator[float]:
+    if not shares or shares[-1] > 1 or shares[0] <= 0:
+        raise ConfigError(f"snapshots={list(cfg.snapshots)}: expected shares of the training, above 0, at most 1")
+    yield from shares

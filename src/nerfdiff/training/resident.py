@@ -132,7 +132,7 @@ class FrozenField:
             with autocast:
                 encoding = model.encode(scenes.images(scene, source), own, scenes.near[scene], scenes.far[scene])
                 rendered.append(model.render(encoding, all_views).rgb.movedim(-1, 2).half())
-            context.append([level.to(torch.bfloat16) for level in encoding.context])
+            context.append(encoding.context)
         shape = (count, min(sources, views))
         self.rendered = torch.cat(rendered).unflatten(0, shape)
         self.context = [torch.cat(level).unflatten(0, shape) for level in zip(*context, strict=True)]

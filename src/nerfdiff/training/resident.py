@@ -375,8 +375,10 @@ def _train(cfg: DictConfig, step: Step, averages: Averages) -> int:
             taken += 1
             averages.update(taken)
             if cuda and taken == cfg.eager_steps:
-                step.capture()
-                taken += 3
+                try:
+                    step.capture()
+                except RuntimeError as error:
+                    log.warning("the step is not recorded, and made kernel by kernel: %s", str(error).splitlines()[0])
             if taken % cfg.log_every_n_steps == 0:  # reading the losses waits for the device, so steps do not pile up
                 losses = {name: value.item() for name, value in step.losses.items()}
                 if not all(map(math.isfinite, losses.values())):

@@ -79,11 +79,21 @@ class Code:
 
     @cached_property
     def _instructions(self) -> list[tuple[int, str]]:
-        """Each one's address and words, but for what follows the program: how lanes that came apart share numbers."""
+        """Each one's address and words, but for what lanes that came apart do to share numbers, which is rare."""
         found = re.findall(r"^\s+/\*([0-9a-f]{4,})\*/\s+(.*?);", self._said("-sass"), re.MULTILINE)
-        apart = next((number for number, (_, words) in enumerate(found) if "COLLECTIVE" in words), len(found))
-        last = max(number for number, (_, words) in enumerate(found[:apart]) if re.match(r"(BRA|EXIT)\b", words))
-        return [(int(place, 16), words) for place, words in found[: last + 1]]
+        numbers = {int(place, 16): number for number, (place, _) in enumerate(found)}
+        reached, ahead = set(), [0]
+        while ahead:
+            number = ahead.pop()
+            if number in reached:
+                continue
+            reached.add(number)
+            words = found[number][1]
+            if (target := _target(words)) is not None:
+                ahead.append(numbers[target])
+            if not re.fullmatch(r"EXIT|BRA(\.\w+)? 0x[0-9a-f]+", words.strip()):
+                ahead.append(number + 1)
+        return [(int(found[number][0], 16), found[number][1]) for number in sorted(reached)]
 
     def issued(self, trips: tuple[float, ...]) -> tuple[float, float]:
         """Instructions of a warp, and bytes that they ask memory for.
@@ -91,8 +101,8 @@ class Code:
         Args:
             trips: how often the longest loop runs at each depth, from the outermost on.
         """
-        jumps = [(place, re.search(r"\bBRA\b.*?(0x[0-9a-f]+)", words)) for place, words in self._instructions]
-        loops = [(int(jump[1], 16), place) for place, jump in jumps if jump and int(jump[1], 16) < place]
+        jumps = [(_target(words), place) for place, words in self._instructions]
+        loops = [(target, place) for target, place in jumps if target is not None and target < place]
 
         def around(place: int) -> list[tuple[int, int]]:
             return sorted(((a, b) for a, b in loops if a <= place <= b), key=lambda loop: loop[0] - loop[1])
@@ -111,6 +121,12 @@ class Code:
                 size = re.search(r"\b(128|64|16|8)\b|x([24])", match[1].replace("U16", "16"))
                 requested += times * 32 * (4 if size is None else int(size[1] or 32 * int(size[2])) / 8)
         return number, requested
+
+
+def _target(words: str) -> int | None:
+    """Where an instruction jumps to, if not for lanes that came apart."""
+    found = re.search(r"\bBRA\b(?!\.DIV).*?(0x[0-9a-f]+)", words)
+    return int(found[1], 16) if found else None
 
 
 def compiled(kernel, capability: int, constants: dict) -> Code:

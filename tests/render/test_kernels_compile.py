@@ -11,6 +11,10 @@ pytest.importorskip("triton.backends.nvidia")
 
 ROOT = Path(__file__).parents[2]
 KERNELS = ("look, uniform", "look, drawn", "draw", "composite", "composite_gradient", "gradient")
+BOUNDS = {"look, uniform": (60, 100), "look, drawn": (60, 90), "gradient": (100, 250)}
+"""Of warp instructions for each point: there is no less to do, and no more was counted by a tenth (sm_80: a half)."""
+FRAME = 16
+"""Bytes of a thread's stack where nothing is spilled, at most."""
 SPILLED = 192
 """Bytes of a thread's registers that other compilers may move to memory, in fp32 with everything asked for."""
 
@@ -26,8 +30,9 @@ def test_every_kernel_compiles_as_it_is_launched(words):
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in halves if line.startswith("|")]
     assert {row[0] for row in rows} == set(KERNELS)
     for name, _, _, stack, warps, instructions, requested in rows:
-        assert int(stack) == 0 and int(warps) > 8, name
-        assert 1 < float(instructions) < (200 if name == "gradient" else 100) and float(requested) > 10, name
+        assert int(stack) <= FRAME and int(warps) > (7 if "80" in words else 8), name
+        least, most = BOUNDS.get(name, (1, 10))
+        assert least < float(instructions) < most and float(requested) > 10, (name, instructions)
     assert "an inner step of 4096 rays at perfect issue" in done.stdout
     assert len(exact) == ("--exact" in words)
     for line in exact[0] if exact else ():

@@ -56,9 +56,9 @@ class Renderer:
         backend: `torch` is this reference; `triton` renders triplane fields by fused kernels; `auto` takes these on a
             GPU, and on a CPU the field in the form that it computes fastest. Where kernels cannot run, the reference
             does, and a log line says why.
-        kernel_precision: of the kernels' texels and activations: `bf16` for halves (they are fp16, and colours are within
-            0.005 of the reference's), `ieee`, `tf32x3` or `tf32` for fp32, or `auto` for halves under autocast alone.
-        least_transmittance: kernels follow a ray no further than to where uniform samples let less of the light through.
+        kernel_precision: of the kernels' texels and activations: `bf16` for halves (they are fp16, and colours within
+            0.002 of the reference's), `ieee`, `tf32x3` or `tf32` for fp32, or `auto` for halves under autocast alone.
+        least_transmittance: kernels follow a ray no further than to where uniform samples let less of the light pass.
             Colours and opacities lack about as much, gradients up to fifty times as much of their length (measured);
             0 follows rays to their ends, as the reference does.
 

@@ -92,7 +92,8 @@ def composite_kernel(
 @triton.jit(do_not_specialize=["n", "first", "count"])
 @no_type_check
 def composite_gradient_kernel(
-    scene_near, scene_far, near, far, distances, values, stops, rgb, opacity, depth, d_rgb, d_opacity, d_depth, d_values,
+    scene_near, scene_far, near, far, distances, values, stops,
+    rgb, opacity, depth, d_rgb, d_opacity, d_depth, d_values,
     background, scale, n, first, count, uniform, samples,
     OPAQUE: tl.constexpr, STOP: tl.constexpr, R: tl.constexpr,
 ):  # fmt: skip
@@ -152,8 +153,8 @@ def composite_gradient_kernel(
         d_density = (g * through - limited) * length * steepest * absorbed(density / steepest)
         if OPAQUE:
             d_density = tl.where(i == samples - 1, 0.0, d_density)
-        store_four(
-            d_values, row * samples + slot, weight * g_red * red * (1.0 - red), weight * g_green * green * (1.0 - green),
-            weight * g_blue * blue * (1.0 - blue), d_density, here,
-        )  # fmt: skip
+        d_red = weight * g_red * red * (1.0 - red)
+        d_green = weight * g_green * green * (1.0 - green)
+        d_blue = weight * g_blue * blue * (1.0 - blue)
+        store_four(d_values, row * samples + slot, d_red, d_green, d_blue, d_density, here)
         edge = next_edge

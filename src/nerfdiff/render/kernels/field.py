@@ -107,11 +107,7 @@ def project(frame, x, y, z):
 def places(u, v, w, valid, H: tl.constexpr, W: tl.constexpr):
     """Of W_xy, W_xz and W_yz, whose columns run along x, x and z: texels (row, column) of each."""
     across, down, deep = texel(u, valid, W), texel(v, valid, H), texel(w, valid, H)
-    if H == W:
-        along = deep
-    else:
-        along = texel(w, valid, W)
-    return (down, across), (deep, across), (down, along)
+    return (down, across), (deep, across), (down, deep if H == W else texel(w, valid, W))
 
 
 @triton.jit

@@ -12,7 +12,8 @@ from nerfdiff.render.kernels.samples import store_four, uniform_distance, vector
 @triton.jit(do_not_specialize=["n", "first", "count", "size_class"])
 @no_type_check
 def look_kernel(
-    table, K, scene_near, scene_far, w2, b2, origins, directions, near, far, jitter, distances, values, cumulative, stops,
+    table, K, scene_near, scene_far, w2, b2, origins, directions, near, far, jitter,
+    distances, values, cumulative, stops,
     image_width, image_height, shift, scale, bound, n, first, count, uniform, samples, jitters, size_class,
     FIRST: tl.constexpr, STOP: tl.constexpr, JITTER: tl.constexpr, SHARED: tl.constexpr, HALF: tl.constexpr,
     HIDDEN: tl.constexpr, HP: tl.constexpr, H: tl.constexpr, W: tl.constexpr, R: tl.constexpr, S: tl.constexpr,

@@ -11,7 +11,7 @@ INTERPRETED = not isinstance(draw_kernel, triton.JITFunction)
 """Whether TRITON_INTERPRET was set when kernels were first imported: they then run on any device, slowly."""
 
 WARPS = 16
-"""Programs of the backward pass for each multiprocessor, of a warp or two; each keeps sums of the decoder's gradients."""
+"""Programs of the backward pass for each multiprocessor, which each keep sums of the decoder's gradients."""
 
 _KEY = ("size_class", "HP", "HALF", "H", "W", "FIRST", "STOP", "TABLE", "DECODER", "RAYS")
 

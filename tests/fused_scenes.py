@@ -1,5 +1,6 @@
 """Random triplane fields and rays, rendered by the kernels and by the float64 reference."""
 
+import os
 import random
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from nerfdiff.render.kernels.texels import hidden_texels
 from nerfdiff.render.renderer import Renderer
 from nerfdiff.render.sampling import KEPT
 
+os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # where a fixed order is asked of PyTorch
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 NAMES = ("planes", "w1", "b1", "w2", "b2", "origins", "directions")
 IMAGE = 18, 14  # width, height

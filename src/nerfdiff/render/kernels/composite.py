@@ -33,7 +33,7 @@ def advance(distances, walk, uniform, drawn, row):
     return (u, d, next_uniform, next_drawn), slot, here, tl.minimum(next_uniform, next_drawn)
 
 
-@triton.jit(do_not_specialize=["n", "first", "count"])
+@triton.jit(do_not_specialize=["n", "first", "count", "uniform", "samples"])
 @no_type_check
 def composite_kernel(
     near, far, distances, values, stops, rgb, opacity, depth, background, n, first, count, uniform, samples,
@@ -89,7 +89,7 @@ def composite_kernel(
     tl.store(depth + at, tl.where(reached, reach / tl.where(reached, total, 1.0), end), mask=here)
 
 
-@triton.jit(do_not_specialize=["n", "first", "count"])
+@triton.jit(do_not_specialize=["n", "first", "count", "uniform", "samples"])
 @no_type_check
 def composite_gradient_kernel(
     scene_near, scene_far, near, far, distances, values, stops,

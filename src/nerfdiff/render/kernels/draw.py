@@ -8,16 +8,17 @@ import triton.language as tl
 from nerfdiff.render.kernels.samples import uniform_distance
 
 
-@triton.jit(do_not_specialize=["n", "first", "count"])
+@triton.jit(do_not_specialize=["n", "first", "count", "uniform", "drawn", "jitters"])
 @no_type_check
 def draw_kernel(
-    cumulative, near, far, jitter, distances, n, first, count, uniform, drawn, jitters, floor,
+    given, cumulative, near, far, jitter, distances, n, first, count, uniform, drawn, jitters, floor,
     JITTER: tl.constexpr, EVEN: tl.constexpr, UP: tl.constexpr, DP: tl.constexpr, R: tl.constexpr,
 ):  # fmt: skip
     """Distances [scenes, count, uniform + drawn]: uniform samples, then drawn ones, both ascending.
 
-    As `importance_distances` over `edges_between` of the uniform samples; EVEN: over equal bins, of which the weights
-    were found without jitter. `cumulative` [scenes, count, uniform] sums weights; UP and DP pad `uniform` and `drawn`.
+    As `importance_distances` over `edges_between` of the uniform samples, whose weights `cumulative` [scenes, count,
+    uniform] sums. EVEN: over equal bins of the weights `given` [scenes, n, uniform], whose sums `cumulative` becomes.
+    UP and DP pad `uniform` and `drawn`.
     """
     scene = tl.program_id(1).to(tl.int64)
     ray = tl.program_id(0) * R + tl.arange(0, R)[:, None]
@@ -34,6 +35,10 @@ def draw_kernel(
     i = tl.arange(0, UP)[None, :]
     there = here & (i < uniform)
     tl.store(out + i, uniform_distance(low, extent, i, uniform, jitter, there, JITTER), mask=there)
+    if EVEN:
+        weight = tl.load(given + at * uniform + i, mask=there, other=0.0).to(tl.float32)
+        tl.store(sums + i, tl.cumsum(weight, 1), mask=there)
+        tl.debug_barrier()  # this program reads them again
 
     total = tl.load(sums + uniform - 1, mask=here, other=0.0)
     hit = total > 1e-8

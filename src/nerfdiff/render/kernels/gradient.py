@@ -9,7 +9,7 @@ from nerfdiff.render.kernels.field import activated, cell, corners, gathered, pl
 from nerfdiff.render.kernels.samples import four, store_vector, vector
 
 
-@triton.jit(do_not_specialize=["n", "first", "count", "points", "size_class"])
+@triton.jit(do_not_specialize=["n", "first", "count", "samples", "segment", "points", "size_class"])
 @no_type_check
 def gradient_kernel(
     table, K, scene_near, scene_far, w2, b2, origins, directions, distances, d_values,

@@ -9,7 +9,7 @@ from nerfdiff.render.kernels.field import query, scene_field
 from nerfdiff.render.kernels.samples import store_four, uniform_distance, vector
 
 
-@triton.jit(do_not_specialize=["n", "first", "count", "size_class"])
+@triton.jit(do_not_specialize=["n", "first", "count", "uniform", "samples", "jitters", "size_class"])
 @no_type_check
 def look_kernel(
     table, K, scene_near, scene_far, w2, b2, origins, directions, near, far, jitter,

@@ -73,16 +73,15 @@ def drawn_distances(
     """Uniform, then importance samples of rays first … first + count of each scene.
 
     Args:
-        sums: of the uniform samples' weights; the bundle's own coarse weights come before them.
+        sums: of the uniform samples' weights; of the bundle's own coarse weights afterwards, where it has some.
         floor: as of `importance_distances`.
     """
     scenes, count, bins = sums.shape
-    if bundle.coarse is not None:
-        sums = bundle.coarse[:, first : first + count].float().cumsum(-1)
     distances = torch.empty(scenes, count, settings.samples, device=sums.device)
-    padded = triton.next_power_of_2(settings.importance_samples)
+    uniform, padded = (max(16, triton.next_power_of_2(size)) for size in (bins, settings.importance_samples))
     rays = max(1, 128 // padded)
     draw_kernel[(triton.cdiv(count, rays), scenes)](
+        given=sums if bundle.coarse is None else bundle.coarse,
         cumulative=sums,
         near=bundle.near,
         far=bundle.far,
@@ -95,10 +94,10 @@ def drawn_distances(
         drawn=settings.importance_samples,
         floor=floor,
         EVEN=bundle.coarse is not None,
-        UP=triton.next_power_of_2(bins),
+        UP=uniform,
         DP=padded,
         R=rays,
-        num_warps=1,
+        num_warps=max(1, padded // 128),
     )
     return distances
 

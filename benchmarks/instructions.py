@@ -160,7 +160,8 @@ def launches() -> list[tuple]:
         found.append((name, getattr(composite, f"{name}_kernel"), walk, walk["R"] * SAMPLES, (SAMPLES,)))
     for block in passes._gradient.blocks:
         points = block["R"] * passes.SEGMENT
-        found.append(("gradient", passes._gradient.kernel, block, points, (1, passes.SEGMENT)))
+        name = "gradient, by runs" if block["RUNS"] else "gradient"
+        found.append((name, passes._gradient.kernel, block, points, (1, passes.SEGMENT)))
     return found
 
 

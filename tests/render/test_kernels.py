@@ -131,7 +131,7 @@ def _interpreted_block(case: Case, draw: random.Random, monkeypatch) -> dict[str
     """Blocks of any shape, large enough that there are not too many: they come one after the other."""
     if not INTERPRETED:
         return None
-    block = {"R": draw.choice((1, 2, 4, 8)), "S": draw.choice((1, 2, 3))}
+    block = {"R": draw.choice((1, 2, 4, 8)), "S": draw.choice((1, 2, 3)), "RUNS": draw.random() < 0.5}
     while case.scenes * -(-case.n // block["R"]) > 3 and block["R"] < case.n:
         block["R"] *= 2
     monkeypatch.setattr(passes, "SEGMENT", draw.choice((5, 32)))
@@ -142,6 +142,11 @@ def _interpreted_block(case: Case, draw: random.Random, monkeypatch) -> dict[str
 
 def test_sums_in_a_fixed_order_are_the_same_sums():
     compare(Case(scenes=2, plane=(2, 3), background=None), ordered=True, points=2 * 6)  # a ray of each scene at a time
+
+
+def test_a_ray_adds_up_what_a_cell_gets_before_it_leaves_it(monkeypatch):
+    monkeypatch.setattr(passes._gradient, "_block", passes._gradient._block | {"RUNS": True})
+    compare(Case(scenes=2, n=3, uniform=4, importance=8, plane=(2, 3)))
 
 
 def test_rays_behind_the_camera_and_rays_that_miss_everything():

@@ -15,15 +15,15 @@ def gradient_kernel(
     table, K, scene_near, scene_far, w2, b2, origins, directions, distances, d_values,
     d_table, d_w2, d_origins, d_directions, d_features, cells, fractions,
     image_width, image_height, n, first, count, samples, segment, points, size_class,
-    TABLE: tl.constexpr, DECODER: tl.constexpr, RAYS: tl.constexpr, SHARED: tl.constexpr, HALF: tl.constexpr,
-    HIDDEN: tl.constexpr, HP: tl.constexpr, H: tl.constexpr, W: tl.constexpr, R: tl.constexpr,
+    TABLE: tl.constexpr, RUNS: tl.constexpr, DECODER: tl.constexpr, RAYS: tl.constexpr, SHARED: tl.constexpr,
+    HALF: tl.constexpr, HIDDEN: tl.constexpr, HP: tl.constexpr, H: tl.constexpr, W: tl.constexpr, R: tl.constexpr,
 ):  # fmt: skip
     """Gradients of rays [scenes, first : first + count] of n, from d_values [scenes, count, samples, 4].
 
     A program takes every so manyeth piece of R rays and `segment` samples (all, where RAYS).
-    TABLE: "atomic" adds to d_table; "ordered" writes features' gradients, their cells and places in them, to be
-    summed in a fixed order; "none". DECODER, RAYS: whether the output layer's weights and rays are asked for. The
-    former are each program's own sums, added to d_w2 [scenes, programs, 4, HP].
+    TABLE: "atomic" adds to d_table, RUNS: not before a ray leaves a cell; "ordered" writes features' gradients, their
+    cells and places in them, to be summed in a fixed order; "none". DECODER, RAYS: whether the output layer's weights
+    and rays are asked for. The former are each program's own sums, added to d_w2 [scenes, programs, 4, HP].
     """
     scene = tl.program_id(1).to(tl.int64)
     table, frame, weights, _ = scene_field(
@@ -51,6 +51,7 @@ def gradient_kernel(
         g_dx = tl.zeros([R], tl.float32)
         g_dy = tl.zeros([R], tl.float32)
         g_dz = tl.zeros([R], tl.float32)
+        runs = (nowhere(R, HP), nowhere(R, HP), nowhere(R, HP)) if RUNS else (0, 0, 0)
         for i in range(begin, tl.minimum(begin + segment, samples)):
             d_red, d_green, d_blue, d_density = four(d_values, row + i, here)
             # what is hidden or empty has nothing to add; a NaN is no zero and gets through
@@ -71,7 +72,15 @@ def gradient_kernel(
                 d_pre += d_blue[:, None] * weights[2][None, :] + d_density[:, None] * weights[3][None, :]
                 d_pre *= gate + hidden * (1.0 - gate)
                 if TABLE == "atomic":
-                    add_to_texels(d_table, d_pre, kept, where, HP, H, W)
+                    if RUNS:
+                        runs = (
+                            onward(d_table, runs[0], d_pre, 0, where[0], HP, H, W),
+                            onward(d_table, runs[1], d_pre, 1, where[1], HP, H, W),
+                            onward(d_table, runs[2], d_pre, 2, where[2], HP, H, W),
+                        )
+                    else:
+                        for plane in tl.static_range(3):
+                            add_cell(d_table, shared(d_pre, plane, where[plane], H, W), kept, HP, H, W)
                 if TABLE == "ordered":
                     even, odd = halves(d_pre)
                     half = d_features + (row + i)[:, None] * HP + tl.arange(0, HP // 2)[None, :]
@@ -89,6 +98,9 @@ def gradient_kernel(
                     g_dx += g_x * t
                     g_dy += g_y * t
                     g_dz += g_z * t
+        if RUNS and TABLE == "atomic":
+            for plane in tl.static_range(3):
+                add_cell(d_table, runs[plane], runs[plane][0] >= 0, HP, H, W)
         if RAYS:
             store_vector(d_origins, at, g_ox, g_oy, g_oz, here)
             store_vector(d_directions, at, g_dx, g_dy, g_dz, here)
@@ -110,31 +122,62 @@ def add_own(at, value):
 
 @triton.jit
 @no_type_check
+def nowhere(R: tl.constexpr, HP: tl.constexpr):
+    """A run in no cell."""
+    none = tl.zeros([R, HP], tl.float32)
+    return tl.full([R], -1, tl.int32), none, none, none, none
+
+
+@triton.jit
+@no_type_check
+def shared(d_pre, PLANE: tl.constexpr, place, H: tl.constexpr, W: tl.constexpr):
+    """A cell, and what its corners get of the gradients of the hidden layer."""
+    w00, w01, w10, w11 = corners(*place)
+    of_corners = d_pre * w00[:, None], d_pre * w01[:, None], d_pre * w10[:, None], d_pre * w11[:, None]
+    return cell(PLANE, place, H, W), of_corners[0], of_corners[1], of_corners[2], of_corners[3]
+
+
+@triton.jit
+@no_type_check
+def onward(d_table, run, d_pre, PLANE: tl.constexpr, place, HP: tl.constexpr, H: tl.constexpr, W: tl.constexpr):
+    """A run, what the corners of one cell got, a sample further: where that is in another cell, it is added."""
+    left = run[0] != cell(PLANE, place, H, W)
+    if tl.max(left.to(tl.int32), 0) > 0:
+        add_cell(d_table, run, left & (run[0] >= 0), HP, H, W)
+    same = tl.where(left, 0.0, 1.0)[:, None]
+    share = shared(d_pre, PLANE, place, H, W)
+    return (
+        share[0],
+        run[1] * same + share[1],
+        run[2] * same + share[2],
+        run[3] * same + share[3],
+        run[4] * same + share[4],
+    )
+
+
+@triton.jit
+@no_type_check
+def add_cell(d_table, share, kept, HP: tl.constexpr, H: tl.constexpr, W: tl.constexpr):
+    """Add to a cell's corners, by atomic additions: in no fixed order."""
+    right: tl.constexpr = HP if W > 1 else 0
+    below: tl.constexpr = W * HP if H > 1 else 0
+    mask = kept[:, None] & (tl.arange(0, HP // 2) >= 0)[None, :]  # the interpreter's atomics take no broadcast masks
+    at = d_table + (share[0] * HP)[:, None] + tl.arange(0, HP // 2)[None, :]
+    for half in tl.static_range(2):
+        tl.atomic_add(at + half * (HP // 2), halves(share[1])[half], mask=mask, sem="relaxed")
+        tl.atomic_add(at + (half * (HP // 2) + right), halves(share[2])[half], mask=mask, sem="relaxed")
+        tl.atomic_add(at + (half * (HP // 2) + below), halves(share[3])[half], mask=mask, sem="relaxed")
+        tl.atomic_add(at + (half * (HP // 2) + below + right), halves(share[4])[half], mask=mask, sem="relaxed")
+
+
+@triton.jit
+@no_type_check
 def halves(d_pre):
     """Units 0 to 3, 8 to 11, … and the others: a thread has 8 units, and adds 4 numbers at once."""
     apart = tl.reshape(d_pre, [d_pre.shape[0], d_pre.shape[1] // 8, 2, 4])
     even, odd = tl.split(tl.permute(apart, [0, 1, 3, 2]))
     shape: tl.constexpr = [d_pre.shape[0], d_pre.shape[1] // 2]
     return tl.reshape(even, shape), tl.reshape(odd, shape)
-
-
-@triton.jit
-@no_type_check
-def add_to_texels(d_table, d_pre, kept, places, HP: tl.constexpr, H: tl.constexpr, W: tl.constexpr):
-    """Gradients [points, HP] of the hidden layer, to three planes by atomic additions: in no fixed order."""
-    right: tl.constexpr = HP if W > 1 else 0
-    below: tl.constexpr = W * HP if H > 1 else 0
-    parts = halves(d_pre)
-    mask = tl.broadcast_to(kept[:, None], parts[0].shape)
-    for plane in tl.static_range(3):
-        w00, w01, w10, w11 = corners(*places[plane])
-        for half in tl.static_range(2):
-            at = d_table + (cell(plane, places[plane], H, W) * HP)[:, None] + tl.arange(0, HP // 2)[None, :]
-            at += half * (HP // 2)
-            tl.atomic_add(at, parts[half] * w00[:, None], mask=mask, sem="relaxed")
-            tl.atomic_add(at + right, parts[half] * w01[:, None], mask=mask, sem="relaxed")
-            tl.atomic_add(at + below, parts[half] * w10[:, None], mask=mask, sem="relaxed")
-            tl.atomic_add(at + (below + right), parts[half] * w11[:, None], mask=mask, sem="relaxed")
 
 
 @triton.jit

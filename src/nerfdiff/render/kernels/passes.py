@@ -17,8 +17,12 @@ from nerfdiff.render.kernels.tuning import Launch, programs_per_scene, size_clas
 from nerfdiff.render.sampling import KEPT, in_bins, uniform_edges
 
 _look = Launch(look_kernel, [{"R": 4, "S": 2, "num_warps": 1}, {"R": 4, "S": 1, "num_warps": 1}], {"R": 16, "S": 2})
+# Runs take the most registers there are, and are faster where many samples fall into one cell.
 _gradient = Launch(
-    gradient_kernel, [{"R": 4, "num_warps": 1}, {"R": 8, "num_warps": 2}], {"R": 16}, added_to=["d_table", "d_w2"]
+    gradient_kernel,
+    [{"R": 4, "RUNS": False, "num_warps": 1}, {"R": 4, "RUNS": True, "num_warps": 1}],
+    {"R": 16, "RUNS": False},
+    added_to=["d_table", "d_w2"],
 )
 RAYS = 32
 """Of a program that composites: a warp, a thread for each."""

@@ -150,7 +150,7 @@ def launches() -> list[tuple]:
     """(name, kernel, constants, points per program, trips of its loops) of all that a step launches."""
     walk, draw = {"R": passes.RAYS, "num_warps": 1}, {"R": max(1, 128 // DRAWN), "num_warps": 1}
     found = []
-    for name, first, points in (("look, uniform", True, UNIFORM), ("look, drawn", False, DRAWN)):
+    for name, first, points in (("look, uniform", True, UNIFORM), ("look, drawn", False, passes.SEGMENT)):
         for block in passes._look.blocks:
             found.append(
                 (name, passes._look.kernel, {**block, "FIRST": first}, block["R"] * points, (points / block["S"],))

@@ -9,20 +9,20 @@ from nerfdiff.render.kernels.field import query, scene_field
 from nerfdiff.render.kernels.samples import store_four, uniform_distance, vector
 
 
-@triton.jit(do_not_specialize=["n", "first", "count", "uniform", "samples", "jitters", "size_class"])
+@triton.jit(do_not_specialize=["n", "first", "count", "uniform", "samples", "jitters", "segment", "size_class"])
 @no_type_check
 def look_kernel(
     table, K, scene_near, scene_far, w2, b2, origins, directions, near, far, jitter,
     distances, values, cumulative, stops,
-    image_width, image_height, shift, scale, bound, n, first, count, uniform, samples, jitters, size_class,
+    image_width, image_height, shift, scale, bound, n, first, count, uniform, samples, jitters, segment, size_class,
     FIRST: tl.constexpr, STOP: tl.constexpr, JITTER: tl.constexpr, SHARED: tl.constexpr, HALF: tl.constexpr,
     HIDDEN: tl.constexpr, HP: tl.constexpr, H: tl.constexpr, W: tl.constexpr, R: tl.constexpr, S: tl.constexpr,
 ):  # fmt: skip
-    """Rays [scenes, first : first + count] of n, R per program, S samples of each at a time.
+    """Rays [scenes, first : first + count] of n, R per program, of each `segment` samples, S at a time.
 
-    FIRST: the uniform samples. Weights are summed in cumulative [scenes, count, uniform], and `stops` [scenes, count]
-    tells behind which distance less than `bound` of the light gets. Otherwise the samples that follow them in
-    distances [scenes, count, samples]. STOP: what lies behind `stops` is not looked at.
+    FIRST: the uniform samples, all in one segment. Weights are summed in cumulative [scenes, count, uniform], and
+    `stops` [scenes, count] tells behind which distance less than `bound` of the light gets. Otherwise the samples that
+    follow them in distances [scenes, count, samples]. STOP: what lies behind `stops` is not looked at.
     Values are red, green, blue and density [scenes, count, samples, 4].
     """
     scene = tl.program_id(1).to(tl.int64)
@@ -47,7 +47,8 @@ def look_kernel(
         passed = tl.full([R], 1.0, tl.float32)
         total = tl.zeros([R], tl.float32)
     else:
-        begin, finish = uniform, samples
+        begin = uniform + tl.program_id(2) * segment
+        finish = tl.minimum(begin + segment, samples)
         if STOP:
             stop = tl.load(stops + row, mask=here, other=0.0)
 

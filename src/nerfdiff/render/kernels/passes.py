@@ -16,7 +16,7 @@ from nerfdiff.render.kernels.look import look_kernel
 from nerfdiff.render.kernels.tuning import Launch, programs_per_scene, size_class
 from nerfdiff.render.sampling import KEPT, in_bins, uniform_edges
 
-_look = Launch(look_kernel, [{"R": 4, "S": 2, "num_warps": 1}, {"R": 4, "S": 1, "num_warps": 1}], {"R": 16, "S": 2})
+_look = Launch(look_kernel, [{"R": 4, "S": 2, "num_warps": 1}, {"R": 8, "S": 1, "num_warps": 1}], {"R": 16, "S": 2})
 # Runs take the most registers there are, and are faster where many samples fall into one cell.
 _gradient = Launch(
     gradient_kernel,
@@ -27,7 +27,7 @@ _gradient = Launch(
 RAYS = 32
 """Of a program that composites: a warp, a thread for each."""
 SEGMENT = 32
-"""Samples of a ray that a program of the backward pass takes at once."""
+"""Samples of a ray that a program takes, where it need not walk along all of them."""
 
 
 def look(settings: Settings, fields: Fields, bundle: Bundle, first: int, count: int) -> Seen:
@@ -39,8 +39,10 @@ def look(settings: Settings, fields: Fields, bundle: Bundle, first: int, count: 
     stops = torch.empty(scenes, count, device=device) if stop else None
 
     def launch(distances: Tensor | None) -> None:
+        segment = uniform if distances is None else SEGMENT
+        pieces = 1 if distances is None else triton.cdiv(settings.importance_samples, SEGMENT)
         _look(
-            lambda constants: (triton.cdiv(count, constants["R"]), scenes),
+            lambda constants: (triton.cdiv(count, constants["R"]), scenes, pieces),
             settings.ordered,
             **fields.arguments(settings),
             shift=float(settings.density_shift),
@@ -55,6 +57,7 @@ def look(settings: Settings, fields: Fields, bundle: Bundle, first: int, count: 
             stops=stops if stop else values,
             bound=float(settings.least_transmittance),
             uniform=uniform,
+            segment=segment,
             **_part(scenes, first, count, settings.samples),
             FIRST=distances is None,
             STOP=stop,

@@ -5,7 +5,7 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
-from nerfdiff.render.kernels.field import query, scene_field
+from nerfdiff.render.kernels.field import exponential, query, scene_field
 from nerfdiff.render.kernels.samples import store_four, uniform_distance, vector
 
 
@@ -68,7 +68,7 @@ def look_kernel(
             if FIRST:
                 after = uniform_distance(low, extent, i + 1, uniform, jitter, here & (i + 1 < uniform), JITTER)
                 next_edge = tl.where(i == uniform - 1, end, 0.5 * (t + after))
-                left = passed * tl.exp(-density * (next_edge - edge))
+                left = passed * exponential(-density * (next_edge - edge))
                 if STOP:
                     left = tl.where(t <= stop, left, passed)
                     stop = tl.where((left < bound) & (passed >= bound), next_edge, stop)

@@ -16,7 +16,7 @@ from nerfdiff.render.kernels.look import look_kernel
 from nerfdiff.render.kernels.tuning import Launch, programs_per_scene, size_class
 from nerfdiff.render.sampling import KEPT, in_bins, uniform_edges
 
-_look = Launch(look_kernel, [{"R": 4, "S": 2, "num_warps": 1}, {"R": 8, "S": 1, "num_warps": 1}], {"R": 16, "S": 2})
+_look = Launch(look_kernel, [{"R": 4, "S": 2, "num_warps": 1}, {"R": 8, "S": 2, "num_warps": 1}], {"R": 16, "S": 2})
 # Runs take the most registers there are, and are faster where many samples fall into one cell.
 _gradient = Launch(
     gradient_kernel,

@@ -26,9 +26,10 @@ from rich.console import Console
 from rich.table import Table
 
 from nerfdiff.cli import load_config
-from nerfdiff.data import images, masks
 from nerfdiff.data.cache import CachedReader
 from nerfdiff.data.datamodule import SceneDataModule
+from nerfdiff.data.formats import images
+from nerfdiff.data.readers import masks
 from nerfdiff.data.scene import SceneReader
 
 

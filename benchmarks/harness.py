@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 
-from nerfdiff.results.timing import Stopwatch, summarise
+from nerfdiff.utils.timing import Stopwatch, summarise
 
 RESULTS = Path(os.environ.get("OUT") or Path(__file__).parent / "results")
 """Where files go that no --out sends elsewhere: into $OUT, where it is set."""

@@ -14,8 +14,8 @@ import torch
 
 import costs
 from harness import Row, Unavailable, Variant, interleaved, parser, settings_of
-from nerfdiff.distill.inner_steps import InnerSteps
-from nerfdiff.distill.ray_batches import RayBatches
+from nerfdiff.fit.inner_steps import InnerSteps
+from nerfdiff.fit.ray_batches import RayBatches
 from nerfdiff.render.renderer import Renderer
 from render import noise_field, with_samples
 from report import Report

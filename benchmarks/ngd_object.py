@@ -26,12 +26,12 @@ from inner_step import steps_of
 from nerfdiff.cli import load_config
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.distillation import Distillation
-from nerfdiff.distill.inner_steps import InnerSteps
-from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.distill.virtual_views import VirtualViews
-from nerfdiff.errors import ConfigError
+from nerfdiff.fit.inner_steps import InnerSteps
+from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.model import NerfDiff
-from nerfdiff.training import plain
+from nerfdiff.utils.config import plain
+from nerfdiff.utils.errors import ConfigError
 from report import Report
 from subjects import Subject, scene, subject
 from variants import models, renderers

@@ -14,9 +14,9 @@ import torch
 import costs
 from harness import DEADLINE, Row, Unavailable, Variant, interleaved, parser, settings_of
 from nerfdiff.cameras import Rays
-from nerfdiff.distill.ray_batches import RayBatches
-from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.field.triplane import Triplane
+from nerfdiff.fit.ray_batches import RayBatches
+from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.render.renderer import Renderer
 from report import Report, duration
 from subjects import Subject, scene, subject

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from harness import NO_TIME, Limits, Row
 from nerfdiff.results.environment import environment
-from nerfdiff.results.files import atomic, write_text
+from nerfdiff.utils.files import atomic, write_text
 
 
 class Report:

@@ -15,10 +15,10 @@ from nerfdiff.cameras import Cameras
 from nerfdiff.checkpoint import load_model
 from nerfdiff.cli import CONF, load_config
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.distill.priors.prior import Prior
+from nerfdiff.distill.priors import Prior
 from nerfdiff.evaluation.subject import choose_device
 from nerfdiff.model import NerfDiff
-from nerfdiff.training import auto_precision, plain
+from nerfdiff.utils.config import auto_precision, plain
 
 SIZES = {"tiny": 32, "small": 64, "base": 128, "large": 128}
 """Pixels that the models are made for."""

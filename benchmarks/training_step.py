@@ -20,11 +20,11 @@ from nerfdiff.cli import load_config
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.diffusion.layout import channels_last
 from nerfdiff.diffusion.unet import AUTO
-from nerfdiff.memory import largest_batch, within_memory
 from nerfdiff.model import NerfDiff
-from nerfdiff.modules.nerfdiff_module import NerfDiffModule
 from nerfdiff.render.renderer import Renderer
-from nerfdiff.training import plain
+from nerfdiff.training.memory import largest_batch, within_memory
+from nerfdiff.training.module import NerfDiffModule
+from nerfdiff.utils.config import plain
 from report import Report
 from subjects import Subject, scene, subject
 from variants import as_kind, kinds, renderers

@@ -10,8 +10,8 @@ from harness import Unavailable
 from nerfdiff.cameras import Cameras, Rays
 from nerfdiff.cli import CONF
 from nerfdiff.compilation import compile_unets
-from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.field.triplane import Triplane
+from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.model import NerfDiff
 from nerfdiff.render.backend import fused
 from nerfdiff.render.renderer import Renderer

@@ -20,4 +20,4 @@ torch.set_num_threads(1)
 if not torch.cuda.is_available():
     interpret_kernels()
 
-install_import_hook("nerfdiff", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
+install_import_hook(["nerfdiff", "procedural"], "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")

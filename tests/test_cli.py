@@ -10,7 +10,7 @@ from omegaconf.errors import OmegaConfBaseException
 from torch.utils.data import DataLoader, Dataset
 
 from nerfdiff.cli import CONF, check_overrides, entry_point, explain, load_config
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.utils.errors import ConfigError, DataError
 
 SRC = Path(__file__).parents[1] / "src"
 

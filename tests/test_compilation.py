@@ -8,7 +8,7 @@ import pytest
 
 from model_fixtures import model
 from nerfdiff.compilation import CACHE_VARIABLE, compile_unets
-from nerfdiff.errors import ConfigError
+from nerfdiff.utils.errors import ConfigError
 
 TESTS = Path(__file__).parent
 

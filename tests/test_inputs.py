@@ -6,8 +6,8 @@ import pytest
 
 from nerfdiff.cli import prepare_arguments
 from nerfdiff.commands import distill, evaluate, export, inspect_data, train
-from nerfdiff.errors import CheckpointError, UserError
 from nerfdiff.inputs import ASSETS, WEIGHTS, find_weights
+from nerfdiff.utils.errors import CheckpointError, UserError
 
 INPUTS = {"distill": ["ckpt", "image", "picture.mask", "data.root"], "evaluate": ["ckpt", "data.root"],
           "export": ["ckpt"], "train": ["data.root"], "inspect_data": ["data.root"], "chart": ["results"]}  # fmt: skip

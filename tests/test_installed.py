@@ -55,8 +55,12 @@ def test_the_wheel_holds_what_a_checkout_has(site):
     for folder in ("conf", "assets"):
         files = {path.relative_to(PROJECT) for path in (PROJECT / folder).rglob("*") if path.is_file()}
         assert files and all((site / "nerfdiff" / file).read_bytes() == (PROJECT / file).read_bytes() for file in files)
+    for folder in ("procedural", "nerfdiff/chart"):
+        files = [path.relative_to(PROJECT / "src") for path in (PROJECT / "src" / folder).rglob("*.*")]
+        assert files and all((site / file).is_file() for file in files if file.suffix != ".pyc"), folder
     (info,) = site.glob("nerfdiff-*.dist-info")
     installed = Distribution.at(info)
+    assert [one for one in installed.requires if "mitsuba" in one] == ['mitsuba>=3.6; extra == "scenes"']
     assert installed.version == nerfdiff.__version__
     assert sorted(one.name for one in installed.entry_points) == [f"nerfdiff-{name}" for name in COMMANDS]
 

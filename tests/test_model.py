@@ -4,7 +4,7 @@ import torch
 from model_fixtures import input_cameras, model
 from nerfdiff.cli import load_config
 from nerfdiff.model import build_on_meta
-from nerfdiff.training import plain
+from nerfdiff.utils.config import plain
 
 
 def counts(size: str) -> dict[str, int]:

@@ -8,8 +8,8 @@ import torch
 from nbclient import NotebookClient
 
 from nerfdiff.cameras import Cameras
-from nerfdiff.data.srn import SRNReader
-from nerfdiff.distill.field_file import load_field
+from nerfdiff.data.readers.srn import SRNReader
+from nerfdiff.fit.saved_field import load_field
 from nerfdiff.metrics.image import psnr
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"

@@ -11,13 +11,13 @@ from model_fixtures import CONFIG, input_cameras, look_at
 from nerfdiff.cameras import Cameras
 from nerfdiff.cli import load_config
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.errors import ConfigError
 from nerfdiff.field.field import PixelField
 from nerfdiff.field.pixel_features import PixelFeatures
 from nerfdiff.field.residual_mlp import ResidualMLP
-from nerfdiff.memory import training_memory
 from nerfdiff.model import NerfDiff, build_on_meta
-from nerfdiff.training import plain
+from nerfdiff.training.memory import training_memory
+from nerfdiff.utils.config import plain
+from nerfdiff.utils.errors import ConfigError
 from pixel_fixtures import ENCODERS, pixel_config
 
 NEAR, FAR = 0.8, 1.8

@@ -5,11 +5,12 @@ import torch
 
 from nerfdiff.checkpoint import check_resumable, load_model
 from nerfdiff.cli import load_config
-from nerfdiff.errors import CheckpointError, ConfigError
 from nerfdiff.evaluation.distill import distill
 from nerfdiff.evaluation.evaluate import evaluate
 from nerfdiff.results.row import read_rows
-from nerfdiff.training import plain, train
+from nerfdiff.training.run import train
+from nerfdiff.utils.config import plain
+from nerfdiff.utils.errors import CheckpointError, ConfigError
 from training_fixtures import evaluation_overrides, last_checkpoint, overrides, write_dataset
 
 SMALL = {

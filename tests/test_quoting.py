@@ -3,8 +3,8 @@ from pathlib import Path
 import pytest
 
 from nerfdiff.cli import load_config, prepare_arguments
-from nerfdiff.errors import ConfigError
 from nerfdiff.quoting import parse_override, quote_values
+from nerfdiff.utils.errors import ConfigError
 
 NAMES = ["photo (1).png", "été.png", "日本.png", "car~1.png", "a=b.png", "it's.png", "car#2.png", "[a](1).png", "2024",
          "'a'.png", 'say "x".png', "a;b&c!.png", "(1).png", "50% off.png", "1e3", "true", "x\\"]  # fmt: skip

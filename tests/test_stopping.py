@@ -14,10 +14,10 @@ from lightning import Callback
 
 from nerfdiff.checkpoint import last_checkpoint as checkpoint_to_resume
 from nerfdiff.cli import entry_point
-from nerfdiff.errors import BusyError, CheckpointError, TrainingDiverged
-from nerfdiff.modules.nerfdiff_module import NerfDiffModule
-from nerfdiff.results.files import held
 from nerfdiff.stopping import SIGNALS, Stopped, on_signals
+from nerfdiff.training.module import NerfDiffModule
+from nerfdiff.utils.errors import BusyError, CheckpointError, TrainingDiverged
+from nerfdiff.utils.files import held
 from training_fixtures import (
     assert_same_state,
     command,
@@ -165,7 +165,7 @@ def test_ctrl_c_reaches_a_run_and_its_workers(data, tmp_path):
             data,
             run,
             *steps,
-            "callbacks.progress={_target_: nerfdiff.callbacks.progress.TrainingProgress, "
+            "callbacks.progress={_target_: nerfdiff.training.callbacks.progress.TrainingProgress, "
             "every_steps: 1, every_seconds: 60}",
         ),
         env=environment(),
@@ -301,7 +301,7 @@ def test_two_commands_do_not_write_one_run(data, run):
         [
             sys.executable,
             "-c",
-            f"import time; from nerfdiff.results.files import held; from pathlib import Path\n"
+            f"import time; from nerfdiff.utils.files import held; from pathlib import Path\n"
             f"with held(Path({str(run)!r})): print('held', flush=True); time.sleep(60)",
         ],
         stdout=subprocess.PIPE,

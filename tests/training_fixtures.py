@@ -9,9 +9,9 @@ import torch
 from lightning import Callback
 
 from data_fixtures import write_scene
-from nerfdiff import training
 from nerfdiff.cli import load_config
-from nerfdiff.training import train
+from nerfdiff.training import run as training
+from nerfdiff.training.run import train
 
 SRC = Path(__file__).parents[1] / "src"
 

@@ -68,7 +68,7 @@ class BudgetedSweeper(Sweeper):
             CompactHydraException: bad choices or numbers, damaged results, or failed jobs that no callback took note
                 of. Hydra prints it as one line.
         """
-        from nerfdiff.errors import UserError
+        from nerfdiff.utils.errors import UserError
 
         try:
             return self._sweep(arguments)
@@ -76,9 +76,9 @@ class BudgetedSweeper(Sweeper):
             raise CompactHydraException(f"error: {error}") from error
 
     def _sweep(self, arguments: list[str]) -> Any:
-        from nerfdiff.errors import ConfigError
         from nerfdiff.sweeps.run import Run
         from nerfdiff.sweeps.space import space_of
+        from nerfdiff.utils.errors import ConfigError
 
         for name, value in (("minutes", self.minutes), ("batch_size", self.batch_size)):
             if value is not None and value <= 0:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfdiff.precision import full_precision
+from nerfdiff.utils.precision import full_precision
 
 
 def along_axes(coordinates: Sequence[Float[Tensor, "*points"]]) -> Float[Tensor, "*points axes"]:

@@ -16,13 +16,13 @@ import yaml
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from nerfdiff.callbacks.snapshots import average_of
-from nerfdiff.errors import CheckpointError, ConfigError
+from nerfdiff.averages import average_of
 from nerfdiff.field.kinds import TRIPLANE
 from nerfdiff.inputs import LAST, PREVIOUS, WEIGHTS, find_weights
 from nerfdiff.model import NerfDiff, build_on_meta
-from nerfdiff.results.files import atomic, write_text
-from nerfdiff.results.hashes import sha256_file, sha256_values
+from nerfdiff.utils.errors import CheckpointError, ConfigError
+from nerfdiff.utils.files import atomic, write_text
+from nerfdiff.utils.hashes import sha256_file, sha256_values
 
 CONFIG, SNAPSHOTS = "model.yaml", "snapshots"
 DIVERGED, DAMAGED = "diverged.ckpt", "damaged.ckpt"

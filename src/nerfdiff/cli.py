@@ -21,14 +21,14 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from nerfdiff.cpu_memory import keep_freed_memory
-from nerfdiff.errors import ConfigError, UserError, is_out_of_memory
 from nerfdiff.inputs import CHECKOUT, CONF, check_inputs, check_output
 from nerfdiff.limits import check_limit, check_limits
 from nerfdiff.noise import quieten
 from nerfdiff.quoting import parse_override, quote_values
-from nerfdiff.results.hashes import sha256_values
 from nerfdiff.stopping import Stopped, leave, on_signals, stop
+from nerfdiff.utils.errors import ConfigError, UserError, is_out_of_memory
+from nerfdiff.utils.hashes import sha256_values
+from nerfdiff.utils.memory import keep_freed_memory
 
 # What a value must be, by the type of its default.
 KINDS: dict[type, tuple[str, tuple[type, ...]]] = {

@@ -8,8 +8,8 @@ import torch
 from torch import nn
 
 from nerfdiff.diffusion.unet import UNet
-from nerfdiff.errors import ConfigError
 from nerfdiff.model import NerfDiff
+from nerfdiff.utils.errors import ConfigError
 
 log = logging.getLogger(__name__)
 

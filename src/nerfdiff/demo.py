@@ -13,11 +13,11 @@ from rich.markup import escape
 from rich.rule import Rule
 
 from nerfdiff.cli import command_words, load_config
-from nerfdiff.errors import UserError
 from nerfdiff.evaluation.evaluate import evaluate
 from nerfdiff.inputs import PACKAGE
-from nerfdiff.scenes.generate import make_scenes
-from nerfdiff.training import train
+from nerfdiff.training.run import train
+from nerfdiff.utils.errors import UserError
+from procedural.generate import make_scenes
 
 
 def demo(cfg: DictConfig) -> None:

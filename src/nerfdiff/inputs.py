@@ -8,7 +8,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from nerfdiff.errors import CheckpointError, ConfigError, DataError
+from nerfdiff.utils.errors import CheckpointError, ConfigError, DataError
 
 PACKAGE = Path(__file__).parent
 CHECKOUT = None if (PACKAGE / "conf").is_dir() else PACKAGE.parents[1]

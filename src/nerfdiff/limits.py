@@ -8,7 +8,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from nerfdiff.errors import ConfigError
+from nerfdiff.utils.errors import ConfigError
 
 AT_LEAST_0, AT_LEAST_1 = (0, math.inf, "at least 0"), (1, math.inf, "at least 1")
 ABOVE_0 = (math.nextafter(0, 1), math.inf, "more than 0")

@@ -9,13 +9,13 @@ from torch import Tensor, nn
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.diffusion.denoiser import Condition, Denoiser
-from nerfdiff.errors import ConfigError
 from nerfdiff.field.encoder import Encoding
 from nerfdiff.field.field import PixelField, TriplaneField
 from nerfdiff.field.kinds import TRIPLANE, encoder_and_decoder
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.render.renderer import Renderer, Rendering
-from nerfdiff.results.timing import timed
+from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.timing import timed
 
 
 class NerfDiff(nn.Module):

@@ -16,7 +16,7 @@ import render
 import training_step
 import unet
 from nerfdiff.distill.distillation import Distillation
-from nerfdiff.errors import ConfigError
+from nerfdiff.utils.errors import ConfigError
 
 TOY = ["--size", "16", "--seconds", "0.001", "--device", "cpu", "--precision", "32-true"]
 SMALL = ["model.unet.channel_mult=[1,2]", "model.render.uniform_samples=4", "model.render.importance_samples=4"]

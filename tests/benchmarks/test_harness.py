@@ -15,7 +15,7 @@ import report
 from harness import Limits, Row, Unavailable, Work, interleaved
 from model_fixtures import CONFIG, model
 from nerfdiff.render.renderer import Renderer
-from nerfdiff.results import timing
+from nerfdiff.utils import timing
 from subjects import Subject
 
 CPU = torch.device("cpu")

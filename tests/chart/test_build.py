@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
 from chart_fixtures import FRONTIERS, KNOWN, chart, failed, result, timing, write_results, write_sheet
 from nerfdiff.chart.build import build_chart
+from nerfdiff.chart.published import LITERATURE
 from nerfdiff.cli import load_config
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.utils.errors import ConfigError, DataError
 
 
 def content(page: Path) -> dict:
@@ -214,15 +216,33 @@ SPEED = {"encode_s": 1.0, "render_s": 1.0, "source": "ssdnerf"}
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"published__values": [ENTRY], "published__speeds": {}}, "published.values: X: source 'nobody'"),
-        ({"published__speeds": {"SRN": SPEED | {"source": "?"}}}, "published.speeds: SRN: source"),
-        ({"published__speeds": {"Nobody": SPEED}}, "published.speeds: .* Nobody"),
-        ({"png__costs": ["money"]}, "png.costs: money is not among"),
+        ({"values": [ENTRY], "speeds": {}}, "published.values: X: source 'nobody'"),
+        ({"speeds": {"SRN": SPEED | {"source": "?"}}}, "published.speeds: SRN: source"),
+        ({"speeds": {"Nobody": SPEED}}, "published.speeds: .* Nobody"),
+        ({"speeds": 3}, "papers.yaml: expected sources, speeds and values"),
+        ({"more": {}}, "papers.yaml: expected sources, speeds and values"),
     ],
 )
-def test_what_is_wrong_in_the_config_is_named(tmp_path, settings, words):
+def test_what_is_wrong_in_published_values_is_named(tmp_path, settings, words):
+    papers = tmp_path / "papers.yaml"
+    papers.write_text(yaml.safe_dump(yaml.safe_load(LITERATURE.read_text()) | settings))
     with pytest.raises(ConfigError, match=words):
-        chart(write_results(tmp_path, result()), **settings)
+        chart(write_results(tmp_path, result()), published=str(papers))
+
+
+@pytest.mark.parametrize(
+    ("content", "words"), [(None, "No such file"), (b"a: [", "while parsing"), (b"\xff", "decode")]
+)
+def test_a_file_of_published_values_that_cannot_be_read_is_named(tmp_path, content, words):
+    if content is not None:
+        (tmp_path / "papers.yaml").write_bytes(content)
+    with pytest.raises(ConfigError, match=rf"papers.yaml cannot be read \(.*{words}"):
+        chart(write_results(tmp_path, result()), published=str(tmp_path / "papers.yaml"))
+
+
+def test_costs_of_pictures_that_the_page_lacks_are_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"png.costs: money is not among"):
+        chart(write_results(tmp_path, result()), png__costs=["money"])
 
 
 def test_results_of_another_schema_are_named_and_do_not_hide_the_others(tmp_path):

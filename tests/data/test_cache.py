@@ -19,9 +19,9 @@ from nerfdiff.data import cache as cache_module
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.cache import CachedReader
 from nerfdiff.data.draws import Draws
-from nerfdiff.data.srn import SRNReader
+from nerfdiff.data.readers.srn import SRNReader
 from nerfdiff.data.views import TrainingViews
-from nerfdiff.errors import DataError
+from nerfdiff.utils.errors import DataError
 
 
 def reader_of(root, image_size=None) -> SRNReader:

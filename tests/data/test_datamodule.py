@@ -13,9 +13,9 @@ from nerfdiff.cli import load_config
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.cache import CachedReader
 from nerfdiff.data.datamodule import SceneDataModule
+from nerfdiff.data.readers.srn import SRNReader
 from nerfdiff.data.scene import MissingSplit
-from nerfdiff.data.srn import SRNReader
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.utils.errors import ConfigError, DataError
 
 
 def datamodule(root, **changes) -> SceneDataModule:

@@ -6,8 +6,8 @@ import torch
 from PIL import Image
 
 from nerfdiff.data.picture import Picture, area_resample, scene_id
-from nerfdiff.data.srn import SRNReader
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.data.readers.srn import SRNReader
+from nerfdiff.utils.errors import ConfigError, DataError
 
 SETTINGS = {
     "mask": None,

@@ -8,10 +8,10 @@ from data_fixtures import FAR, NEAR, write_srn
 from nerfdiff.data.batch import Sample, ViewBatch
 from nerfdiff.data.cache import CachedReader
 from nerfdiff.data.draws import Draws
-from nerfdiff.data.posed_images import PosedImagesReader
-from nerfdiff.data.srn import SRNReader
+from nerfdiff.data.readers.posed_images import PosedImagesReader
+from nerfdiff.data.readers.srn import SRNReader
 from nerfdiff.data.views import EvaluationScenes, TrainingViews, spread
-from nerfdiff.errors import DataError
+from nerfdiff.utils.errors import DataError
 
 
 @pytest.fixture

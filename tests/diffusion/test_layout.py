@@ -4,8 +4,8 @@ import torch
 from nerfdiff.cli import load_config
 from nerfdiff.diffusion import layout
 from nerfdiff.diffusion.layout import channels_last
-from nerfdiff.errors import ConfigError
 from nerfdiff.evaluation.subject import dataset_subject
+from nerfdiff.utils.errors import ConfigError
 from training_fixtures import evaluation_overrides, last_checkpoint, run_training, write_dataset
 
 CPU, GPU, OTHER = torch.device("cpu"), torch.device("cuda", 0), torch.device("mps")

@@ -9,7 +9,7 @@ from model_fixtures import config
 from nerfdiff.diffusion.blocks import Attention, Upsample, time_embedding
 from nerfdiff.diffusion.deep_features import DeepFeatures, DeepReuse
 from nerfdiff.diffusion.unet import Stage, UNet
-from nerfdiff.errors import ConfigError
+from nerfdiff.utils.errors import ConfigError
 
 SMALL = config()["unet"]
 

@@ -8,8 +8,7 @@ import torch
 
 from nerfdiff.diffusion.sampler import SAMPLERS
 from nerfdiff.diffusion.schedule import alpha_sigma, expand
-from nerfdiff.distill.guidance import Guidance
-from nerfdiff.distill.ngd import GuidedViews
+from nerfdiff.distill.ngd import Guidance, GuidedViews
 from nerfdiff.distill.virtual_views import VirtualViews
 
 K, SHAPE = 5, (3, 2, 2)

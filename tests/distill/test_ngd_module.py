@@ -10,14 +10,13 @@ from nerfdiff.cameras import Cameras
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.direct import SampledViews
 from nerfdiff.distill.distillation import Distillation
-from nerfdiff.distill.guidance import Guidance
-from nerfdiff.distill.ngd import GuidedViews
-from nerfdiff.distill.ray_batches import RayBatches
-from nerfdiff.distill.refined_field import RefinedField
+from nerfdiff.distill.module import LOOKS, NGDModule
+from nerfdiff.distill.ngd import Guidance, GuidedViews
 from nerfdiff.distill.sds import DenoisedRenderings
 from nerfdiff.distill.stochastic import AutoregressiveViews
-from nerfdiff.errors import ConfigError
-from nerfdiff.modules.ngd_module import LOOKS, NGDModule
+from nerfdiff.fit.ray_batches import RayBatches
+from nerfdiff.fit.refined_field import RefinedField
+from nerfdiff.utils.errors import ConfigError
 
 
 def scene(name: str = "a") -> ViewBatch:

@@ -9,16 +9,12 @@ import torch
 from nerfdiff.cameras import Cameras
 from nerfdiff.cli import load_config
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.distill.priors.circle import Circle, plane_normal
-from nerfdiff.distill.priors.own_views import OwnViews
-from nerfdiff.distill.priors.prior import Prior, all_cameras
-from nerfdiff.distill.priors.sphere import Sphere
-from nerfdiff.distill.priors.srn_spiral import SRNSpiral
-from nerfdiff.errors import ConfigError, DataError
-from nerfdiff.orbit import look_at_point
-from nerfdiff.scenes.kinds.clevr3d import Clevr3DScenes
-from nerfdiff.scenes.kinds.kind import SceneJob
-from nerfdiff.scenes.poses import look_at_origin
+from nerfdiff.distill.priors import Circle, OwnViews, Prior, Sphere, SRNSpiral, all_cameras, plane_normal
+from nerfdiff.poses import look_at_origin
+from nerfdiff.trajectories import look_at_point
+from nerfdiff.utils.errors import ConfigError, DataError
+from procedural.kinds.clevr3d import Clevr3DScenes
+from procedural.kinds.kind import SceneJob
 
 K = torch.tensor([[20.0, 0, 9.0], [0, 20.0, 7.0], [0, 0, 1]])
 

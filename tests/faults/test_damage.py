@@ -15,10 +15,10 @@ from fault_fixtures import *  # noqa: F403
 from fault_fixtures import change, flip, flip_weights, go_on
 from nerfdiff.checkpoint import export, last_checkpoint, load_model, read_checkpoint
 from nerfdiff.data.cache import CachedReader
-from nerfdiff.data.srn import SRNReader
-from nerfdiff.errors import CheckpointError, DataError, size_text
+from nerfdiff.data.readers.srn import SRNReader
 from nerfdiff.inputs import ASSETS
-from nerfdiff.modules.kept_renderings import KeptRenderings
+from nerfdiff.training.kept_renderings import KeptRenderings
+from nerfdiff.utils.errors import CheckpointError, DataError, size_text
 
 
 def test_flipped_weights_are_noticed_and_the_checkpoint_before_is_taken(fault_data, damaged_run, caplog):

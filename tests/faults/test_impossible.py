@@ -18,16 +18,16 @@ from PIL import Image
 from fault_fixtures import *  # noqa: F403
 from nerfdiff.cli import explain, load_config, prepare_arguments
 from nerfdiff.data.cache import CachedReader
-from nerfdiff.data.images import decode
-from nerfdiff.data.npz_files import read_array
-from nerfdiff.data.posed_files import read_text
-from nerfdiff.data.srn import SRNReader
+from nerfdiff.data.formats.images import decode
+from nerfdiff.data.formats.npz_files import read_array
+from nerfdiff.data.formats.posed_files import read_text
+from nerfdiff.data.readers.srn import SRNReader
 from nerfdiff.distill.distillation import Distillation
-from nerfdiff.errors import ConfigError, DataError, OutOfMemory, UserError
 from nerfdiff.evaluation.distill import distill
 from nerfdiff.limits import check_limits
-from nerfdiff.results.files import atomic, remove_leftovers
 from nerfdiff.results.row import read_rows
+from nerfdiff.utils.errors import ConfigError, DataError, OutOfMemory, UserError
+from nerfdiff.utils.files import atomic, remove_leftovers
 from training_fixtures import evaluation_overrides, overrides, run_training
 
 

@@ -20,14 +20,15 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from chart_fixtures import KNOWN, chart, failed, result, write_results, write_scores, write_sheet
-from nerfdiff.errors import DataError, UserError
 from nerfdiff.results.intervals import Bootstrap
-from nerfdiff.results.row import ResultRow, RowFile, append_row, encode, read_rows
-from nerfdiff.results.sweep_jobs import group, jobs_of
-from nerfdiff.results.sweep_lines import lines_of
-from nerfdiff.results.sweep_text import to_csv, to_markdown, to_rich
+from nerfdiff.results.row import ResultRow, RowFile, append_row, read_rows
 from nerfdiff.results.table import markdown, rich_table
+from nerfdiff.sweeps.jobs import group, jobs_of
+from nerfdiff.sweeps.lines import lines_of
 from nerfdiff.sweeps.plan import write_plan
+from nerfdiff.sweeps.text import to_csv, to_markdown, to_rich
+from nerfdiff.utils.errors import DataError, UserError
+from nerfdiff.utils.files import encode
 
 SRC = Path(__file__).parents[2] / "src"
 FIELDS = tuple(asdict(result()))

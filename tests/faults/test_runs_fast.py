@@ -9,11 +9,11 @@ import torch
 
 from fault_child import start
 from fault_fixtures import *  # noqa: F403
-from nerfdiff.callbacks.checkpoint import ClearCheckpointIO
 from nerfdiff.checkpoint import read_checkpoint
-from nerfdiff.errors import CheckpointError
 from nerfdiff.metrics.predictions import PredictionWriter, read_prediction
-from nerfdiff.results import files
+from nerfdiff.training.callbacks.checkpoint import ClearCheckpointIO
+from nerfdiff.utils import files
+from nerfdiff.utils.errors import CheckpointError
 
 TOUCHES = ("replace", "fsync", "link", "rename", "mkdir", "chmod", "unlink", "open", "rmdir")
 

@@ -27,10 +27,10 @@ from fault_fixtures import *  # noqa: F403
 from fault_fixtures import flip
 from nerfdiff.checkpoint import load_model, read_checkpoint
 from nerfdiff.cli import load_config
-from nerfdiff.errors import UserError
 from nerfdiff.evaluation.distill import distill
 from nerfdiff.metrics.predictions import read_prediction
 from nerfdiff.results.row import read_rows
+from nerfdiff.utils.errors import UserError
 from training_fixtures import (
     assert_same_state,
     command,

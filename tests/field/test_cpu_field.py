@@ -5,10 +5,9 @@ import torch
 
 from model_fixtures import input_cameras
 from nerfdiff.cameras import Rays
-from nerfdiff.field.cpu_field import scene_by_scene, suits
+from nerfdiff.field.cpu_field import Interpolate, scene_by_scene, suits
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.field import TriplaneField
-from nerfdiff.field.interpolation import Interpolate
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.render import renderer as renderer_module
 from nerfdiff.render.renderer import Renderer, Rendering

@@ -3,10 +3,10 @@ import torch
 import torchvision
 from torch import nn
 
-from nerfdiff.errors import ConfigError
 from nerfdiff.field.resnet import ResNetPyramid
 from nerfdiff.field.vision_features import Reassembled, VisionFeatures
 from nerfdiff.field.vision_transformer import TransformerBlock, VisionTransformer
+from nerfdiff.utils.errors import ConfigError
 from pixel_fixtures import ENCODERS
 
 

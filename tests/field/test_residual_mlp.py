@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from nerfdiff.errors import ConfigError
 from nerfdiff.field.residual_mlp import ResidualMLP
+from nerfdiff.utils.errors import ConfigError
 
 
 def mlp(injections: int = 2, **changes) -> ResidualMLP:

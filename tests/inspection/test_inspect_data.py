@@ -13,12 +13,12 @@ from rich.console import Console
 from solids import HEIGHT, WIDTH, write_solids
 
 from nerfdiff.cli import load_config
-from nerfdiff.errors import DataError
 from nerfdiff.inspection.bounds_plot import Distances, write_bounds_plot
 from nerfdiff.inspection.inspect import inspect_data
 from nerfdiff.inspection.report import markdown, print_report
 from nerfdiff.inspection.summary import SplitSummary, summarise_split
 from nerfdiff.inspection.survey import Sample, sampled, survey_split
+from nerfdiff.utils.errors import DataError
 from posed_fixtures import CENTRE, write_nerfstudio
 
 SPLITS = {"train": 3, "test": 2}

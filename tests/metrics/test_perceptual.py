@@ -8,9 +8,9 @@ import torch
 from kornia.filters import gaussian_blur2d
 from stlpips_pytorch import stlpips
 
-from nerfdiff.errors import DataError
 from nerfdiff.metrics.perceptual import LPIPS, LPIPS_VGG, STLPIPS, at_least
 from nerfdiff.metrics.weights import WeightsFile
+from nerfdiff.utils.errors import DataError
 
 
 @pytest.fixture(scope="module")

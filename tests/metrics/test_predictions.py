@@ -7,13 +7,13 @@ import pytest
 import torch
 from PIL import Image
 
-from nerfdiff.errors import DataError
 from nerfdiff.metrics.predictions import (
     NonFinitePrediction,
     PredictionWriter,
     read_plan,
     read_prediction,
 )
+from nerfdiff.utils.errors import DataError
 
 IDENTITY = {"config_sha256": "aa", "seed": 0}
 

@@ -13,10 +13,10 @@ from omegaconf import OmegaConf
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.scene import Scene
-from nerfdiff.errors import DataError
 from nerfdiff.metrics.predictions import PredictionWriter
 from nerfdiff.metrics.score import Scorer, truth_from
 from nerfdiff.results.row import ResultRow
+from nerfdiff.utils.errors import DataError
 
 CONFIG = Path(__file__).parents[2] / "conf" / "metrics" / "default.yaml"
 SIZE = 8

@@ -10,18 +10,18 @@ from solid_scene import FAR, NEAR, pictures, ring
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.scene import Scene
-from nerfdiff.distill.field_file import FIELD, SavedField, load_field, save_field
-from nerfdiff.distill.refined_field import RefinedField
-from nerfdiff.errors import DataError
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.triplane import Triplane
+from nerfdiff.fit.refined_field import RefinedField
+from nerfdiff.fit.saved_field import FIELD, SavedField, load_field, save_field
 from nerfdiff.metrics.geometry import depth_extent, floaters
 from nerfdiff.metrics.predictions import PredictionWriter
 from nerfdiff.metrics.score import truth_from
-from nerfdiff.randomness import generator
 from nerfdiff.render.renderer import Renderer
 from nerfdiff.results.row import ResultRow
 from nerfdiff.results.table import markdown
+from nerfdiff.utils.errors import DataError
+from nerfdiff.utils.randomness import generator
 
 CONFIG = Path(__file__).parents[2] / "conf" / "metrics" / "default.yaml"
 SIZE, VIEWS = 16, 7

@@ -9,11 +9,11 @@ import torch
 pytest.importorskip("triton")
 
 from fused_scenes import DEVICE, BackendScene
-from nerfdiff.errors import ConfigError
 from nerfdiff.render import backend
 from nerfdiff.render.kernels import function, tuning
 from nerfdiff.render.renderer import Renderer
 from nerfdiff.render.sampling import KEPT
+from nerfdiff.utils.errors import ConfigError
 
 pytestmark = pytest.mark.usefixtures("fresh_backend")
 

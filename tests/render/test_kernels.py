@@ -12,11 +12,10 @@ from torch import Tensor
 pytest.importorskip("triton")
 
 from fused_scenes import DEVICE, LAUNCHES, NAMES, Case, drawn_case, without_trials
-from nerfdiff.render.compositing import compositing_weights
 from nerfdiff.render.kernels import passes
 from nerfdiff.render.kernels.arguments import Bundle, Seen
 from nerfdiff.render.kernels.tuning import INTERPRETED
-from nerfdiff.render.sampling import edges_between, importance_distances, in_bins, uniform_edges
+from nerfdiff.render.sampling import compositing_weights, edges_between, importance_distances, in_bins, uniform_edges
 
 on_gpu = pytest.mark.skipif(DEVICE.type == "cpu", reason="needs a GPU")
 

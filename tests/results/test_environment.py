@@ -4,8 +4,8 @@ import torch
 from omegaconf import OmegaConf
 
 from nerfdiff.results.environment import environment, git_state
-from nerfdiff.results.hashes import sha256_file, sha256_values
 from nerfdiff.results.row import ResultRow
+from nerfdiff.utils.hashes import sha256_file, sha256_values
 
 
 def git(folder, *arguments):

@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 
 from chart_fixtures import SCENES, failed, result, timing, write_results, write_scores
-from nerfdiff.errors import DataError
 from nerfdiff.results.frame import (
     Run,
     configurations,
@@ -18,6 +17,7 @@ from nerfdiff.results.frame import (
     runs_frame,
 )
 from nerfdiff.results.intervals import Bootstrap, Estimate
+from nerfdiff.utils.errors import DataError
 
 BOOTSTRAP = Bootstrap(resamples=500, level=0.9, seed=3)
 

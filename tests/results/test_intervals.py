@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from nerfdiff.errors import ConfigError
 from nerfdiff.results.intervals import Bootstrap, Estimate, spread
+from nerfdiff.utils.errors import ConfigError
 
 
 def test_intervals_are_those_of_a_loop_over_draws():

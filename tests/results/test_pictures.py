@@ -4,8 +4,8 @@ import pytest
 import torch
 from PIL import Image
 
-from nerfdiff.errors import DataError
 from nerfdiff.results.pictures import colour_depth, contact_sheet, orbit_video
+from nerfdiff.utils.errors import DataError
 
 
 def colours(n, size=32):

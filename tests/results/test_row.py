@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from nerfdiff.errors import DataError
 from nerfdiff.results import row as rows_module
 from nerfdiff.results.row import COLUMNS, ResultRow, RowFile, append_row, flatten, read_rows
 from nerfdiff.results.text import write_csv
+from nerfdiff.utils.errors import DataError
 
 SRC = Path(__file__).parents[2] / "src"
 CONTRACT = {

@@ -4,11 +4,11 @@ import sys
 
 import pytest
 
-from nerfdiff.errors import ConfigError
 from nerfdiff.results.row import ResultRow
 from nerfdiff.sweeps.optuna_proposals import Optuna
 from nerfdiff.sweeps.proposals import Random
 from nerfdiff.sweeps.space import Axis, Space
+from nerfdiff.utils.errors import ConfigError
 
 pytest.importorskip("optuna", reason="Optuna is an optional extra: pip install optuna")
 

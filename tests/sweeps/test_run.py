@@ -8,16 +8,16 @@ from hydra.errors import CompactHydraException
 from hydra.plugins.launcher import Launcher
 from omegaconf import OmegaConf
 
-from nerfdiff.errors import DataError
 from nerfdiff.evaluation import measure
 from nerfdiff.results.row import ResultRow, append_row, read_rows
-from nerfdiff.results.sweep_jobs import jobs_of
 from nerfdiff.sweeps import task as task_module
+from nerfdiff.sweeps.jobs import jobs_of
 from nerfdiff.sweeps.plan import read_plan
 from nerfdiff.sweeps.proposals import Grid, Random
 from nerfdiff.sweeps.run import DEATHS, Run
 from nerfdiff.sweeps.space import Axis, Space
 from nerfdiff.sweeps.task import Task
+from nerfdiff.utils.errors import DataError
 
 N = 6
 SPACE = Space(((Axis("x", tuple(f"x={i}" for i in range(N))), Axis("ckpt", ("ckpt=demo",))),), (), ("seed=0", "seed=1"))

@@ -7,8 +7,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from nerfdiff.cli import CONF
-from nerfdiff.errors import ConfigError
 from nerfdiff.sweeps.space import Axis, Space, axes_of, space_of
+from nerfdiff.utils.errors import ConfigError
 
 NGD = {
     "name": "ngd",

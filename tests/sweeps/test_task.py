@@ -6,7 +6,7 @@ import pytest
 
 JOBS = """
 from omegaconf import OmegaConf
-from nerfdiff.cpu_memory import peak_memory
+from nerfdiff.utils.memory import peak_memory
 from nerfdiff.sweeps.task import Task
 
 def job(cfg):

@@ -16,9 +16,8 @@ from nerfdiff.chart.page import write_page
 from nerfdiff.chart.payload import Measured, configuration_values, failure_values, failures, measured, share_words
 from nerfdiff.chart.pictures import SmallSheets
 from nerfdiff.chart.png import write_png
-from nerfdiff.chart.published import published_for
+from nerfdiff.chart.published import published_for, read_published
 from nerfdiff.cli import command_words
-from nerfdiff.errors import ConfigError, DataError
 from nerfdiff.results.frame import (
     CONFIGURATION_COLUMNS,
     RESULTS,
@@ -31,6 +30,7 @@ from nerfdiff.results.frame import (
 )
 from nerfdiff.results.row import COLUMNS, RowFile
 from nerfdiff.results.text import one_line, write_csv
+from nerfdiff.utils.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ def build_chart(cfg: DictConfig) -> Path:
     Raises:
         DataError: there is no such file or folder, or a file of results has no row that can be read (of files found
             within a folder the page says so instead, as long as others can be read; as it does of single lines).
-        ConfigError: published values are inconsistent.
+        ConfigError: the file of published values cannot be read, or they are inconsistent.
     """
     places = _places(cfg.results)
     found = _read(places)
@@ -82,7 +82,8 @@ def build_chart(cfg: DictConfig) -> Path:
     metrics, costs = _plain(cfg.metrics), _plain(cfg.costs)
     bootstrap = instantiate(cfg.bootstrap)
     content = measured(configurations(found.runs, bootstrap, found.warn), metrics, costs, cfg.unnamed)
-    published = [published_for(panel, **_plain(cfg.published)) for panel in content.panels]
+    papers = read_published(cfg.published)
+    published = [published_for(panel, **papers) for panel in content.panels]
     failed = failures(found.runs)
 
     page = out / "index.html"

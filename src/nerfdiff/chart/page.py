@@ -11,7 +11,7 @@ import itables
 from plotly.offline import get_plotlyjs
 
 from nerfdiff.chart.payload import to_json
-from nerfdiff.results.files import write_text
+from nerfdiff.utils.files import write_text
 
 PARTS = Path(__file__).parent / "page"
 SCRIPTS = ("state", "colours", "axes", "plot", "tip", "details", "pick", "cards", "table", "main")

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from nerfdiff.chart.frontier import frontier
 from nerfdiff.chart.labels import labels_of, names_of
 from nerfdiff.chart.panels import Panel, panels_of
 from nerfdiff.chart.pictures import links
 from nerfdiff.results.frame import Configuration, Run, newest
+from nerfdiff.results.frontier import frontier
 from nerfdiff.results.intervals import Estimate
 
 

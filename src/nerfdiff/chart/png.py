@@ -13,9 +13,9 @@ from matplotlib.lines import Line2D
 
 from nerfdiff.chart.panels import Panel
 from nerfdiff.chart.payload import Measured
-from nerfdiff.results.files import atomic
 from nerfdiff.results.intervals import Estimate
 from nerfdiff.results.text import figure_text, one_line
+from nerfdiff.utils.files import atomic
 
 INK, PAPERS = "#1d2430", "#6b4a00"
 KINDS = ("#0b62b8", "#d1570a", "#1a8a5a", "#8a4fbf", "#b3261e", "#0f8fa3", "#8a6d1d", "#c2408f", "#5d8a00", "#5c6675")

@@ -1,13 +1,34 @@
 """Values from papers, as markers of another kind."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+import yaml
+
 from nerfdiff.chart.panels import Panel
-from nerfdiff.errors import ConfigError
+from nerfdiff.utils.errors import ConfigError
 
 NOT_METRICS = ("method", "dataset", "image_size", "source")
 SPEEDS = ("encode_s", "render_s")
+LITERATURE = Path(__file__).with_name("literature.yaml")
+
+
+def read_published(path: str | Path | None) -> dict[str, Any]:
+    """The values, speeds and sources of a YAML file, for `published_for`; None is the file that comes along.
+
+    Raises:
+        ConfigError: the file cannot be read, or holds something else.
+    """
+    path = LITERATURE if path is None else Path(path)
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise ConfigError(f"published={path} cannot be read ({' '.join(str(error).split())})") from error
+    kinds = {"sources": dict, "speeds": dict, "values": list}
+    if not isinstance(content, dict) or {key: type(value) for key, value in content.items()} != kinds:
+        raise ConfigError(f"published={path}: expected sources, speeds and values, in the form of {LITERATURE}")
+    return content
 
 
 def published_for(

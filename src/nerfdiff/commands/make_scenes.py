@@ -8,7 +8,7 @@ from nerfdiff.cli import entry_point
 @entry_point("make_scenes")
 def main(cfg: DictConfig) -> None:
     """Scenes already there are kept."""
-    from nerfdiff.scenes.generate import make_scenes
+    from procedural.generate import make_scenes
 
     make_scenes(cfg)
 

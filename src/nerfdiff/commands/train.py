@@ -8,7 +8,7 @@ from nerfdiff.cli import entry_point
 @entry_point("train", "data.root", "init")
 def main(cfg: DictConfig) -> float | None:
     """Returns the held-out PSNR, which a sweep may optimise."""
-    from nerfdiff.training import train  # slow to import: not for --cfg
+    from nerfdiff.training.run import train  # slow to import: not for --cfg
 
     return train(cfg).get("val/psnr")
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.scene import Scene
-from nerfdiff.errors import DataError
+from nerfdiff.utils.errors import DataError
 
 
 @dataclass(frozen=True)

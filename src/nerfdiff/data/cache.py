@@ -31,8 +31,8 @@ from torch import Tensor
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.scene import Listing, Scene, SceneReader
-from nerfdiff.errors import DataError, size_text
-from nerfdiff.results.hashes import sha256_file, sha256_values
+from nerfdiff.utils.errors import DataError, size_text
+from nerfdiff.utils.hashes import sha256_file, sha256_values
 
 FORMAT = "4"  # to be raised when the files above change their meaning, or readers decode other pixels
 MAX_THREADS = 16  # decoding releases the interpreter lock, but not all the time

@@ -16,8 +16,8 @@ from nerfdiff.data.cache import CachedReader
 from nerfdiff.data.draws import Draws, DrawSampler
 from nerfdiff.data.scene import MissingSplit, SceneReader
 from nerfdiff.data.views import EvaluationScenes, TrainingViews, spread
-from nerfdiff.errors import ConfigError
 from nerfdiff.stopping import ignore_signals
+from nerfdiff.utils.errors import ConfigError
 
 log = logging.getLogger(__name__)
 

@@ -16,10 +16,10 @@ from skimage.measure import label
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.batch import Sample, ViewBatch
-from nerfdiff.data.images import decode_with_alpha
-from nerfdiff.data.masks import read_mask
+from nerfdiff.data.formats.images import decode_with_alpha
+from nerfdiff.data.readers.masks import read_mask
 from nerfdiff.data.scene import Scene
-from nerfdiff.errors import ConfigError, DataError
+from nerfdiff.utils.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras
-from nerfdiff.errors import DataError
+from nerfdiff.utils.errors import DataError
 
 
 class MissingSplit(DataError):

@@ -8,7 +8,7 @@ from torch.utils.data import Dataset
 from nerfdiff.data.batch import Sample
 from nerfdiff.data.draws import Draws
 from nerfdiff.data.scene import SceneReader
-from nerfdiff.errors import DataError, some
+from nerfdiff.utils.errors import DataError, some
 
 log = logging.getLogger(__name__)
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from nerfdiff.errors import ConfigError
+from nerfdiff.utils.errors import ConfigError
 
 
 @dataclass(frozen=True)

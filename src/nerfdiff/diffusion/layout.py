@@ -3,7 +3,7 @@
 import torch
 
 from nerfdiff.diffusion.norm_silu import kernels_run
-from nerfdiff.errors import ConfigError
+from nerfdiff.utils.errors import ConfigError
 
 
 def channels_last(choice: object, device: torch.device, compiled: bool) -> bool:

@@ -20,7 +20,7 @@ from nerfdiff.diffusion.blocks import (
 )
 from nerfdiff.diffusion.deep_features import DeepFeatures
 from nerfdiff.diffusion.norm_silu import norm_silu
-from nerfdiff.errors import ConfigError
+from nerfdiff.utils.errors import ConfigError
 
 Context = Sequence[Tensor | KeyValue]
 """What a U-Net attends to, one entry per attention block: a twin's features, or `UNet.keys_values` of them."""

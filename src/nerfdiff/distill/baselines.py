@@ -13,7 +13,7 @@ from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.distill.strategy import Views
 from nerfdiff.model import NerfDiff
-from nerfdiff.randomness import generator
+from nerfdiff.utils.randomness import generator
 
 
 @dataclass(frozen=True)

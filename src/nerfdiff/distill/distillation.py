@@ -9,16 +9,16 @@ import torch
 from lightning import Callback, Trainer
 
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.distill.field_file import SavedField
-from nerfdiff.distill.priors.prior import Prior
-from nerfdiff.distill.refined_field import RefinedField
+from nerfdiff.distill.module import NGDModule
+from nerfdiff.distill.priors import Prior
 from nerfdiff.distill.strategy import Views
 from nerfdiff.distill.teacher import MakeTeacher
 from nerfdiff.distill.virtual_views import VirtualViews
-from nerfdiff.errors import ConfigError
 from nerfdiff.field.triplane import Triplane
+from nerfdiff.fit.refined_field import RefinedField
+from nerfdiff.fit.saved_field import SavedField
 from nerfdiff.model import NerfDiff
-from nerfdiff.modules.ngd_module import NGDModule
+from nerfdiff.utils.errors import ConfigError
 
 log = logging.getLogger(__name__)
 

@@ -7,12 +7,12 @@ import torch
 from lightning import Callback
 
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.distill.field_file import SavedField
-from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.distill.strategy import Views
 from nerfdiff.field.kinds import TRIPLANE
+from nerfdiff.fit.refined_field import RefinedField
+from nerfdiff.fit.saved_field import SavedField
 from nerfdiff.model import NerfDiff
-from nerfdiff.results.timing import timed
+from nerfdiff.utils.timing import timed
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from nerfdiff.diffusion.schedule import add_noise, alpha_sigma, expand
 from nerfdiff.distill.teacher import sees_current
 from nerfdiff.distill.virtual_views import Images, VirtualViews
-from nerfdiff.errors import ConfigError
+from nerfdiff.utils.errors import ConfigError
 
 
 class DenoisedRenderings:

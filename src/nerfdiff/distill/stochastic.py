@@ -6,11 +6,11 @@ import torch
 
 from nerfdiff.diffusion.denoiser import Condition
 from nerfdiff.diffusion.sampler import make_sampler, time_steps
-from nerfdiff.distill.fixed_images import FixedImages
+from nerfdiff.distill.direct import FixedImages
 from nerfdiff.distill.virtual_views import VirtualViews
 from nerfdiff.field.encoder import Encoding
-from nerfdiff.randomness import generator
-from nerfdiff.results.timing import timed
+from nerfdiff.utils.randomness import generator
+from nerfdiff.utils.timing import timed
 
 
 class AutoregressiveViews(FixedImages):

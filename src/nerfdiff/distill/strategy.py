@@ -11,12 +11,12 @@ from torch import Tensor
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.distill.field_file import SavedField
 from nerfdiff.distill.trace import Step
+from nerfdiff.fit.saved_field import SavedField
 from nerfdiff.metrics.depth import z_depth
 from nerfdiff.model import NerfDiff
 from nerfdiff.render.renderer import Renderer, Rendering
-from nerfdiff.results.timing import timed
+from nerfdiff.utils.timing import timed
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 from nerfdiff.distill.virtual_views import Images, VirtualViews
-from nerfdiff.errors import ConfigError
+from nerfdiff.utils.errors import ConfigError
 
 
 @runtime_checkable

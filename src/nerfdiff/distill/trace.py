@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 from nerfdiff.metrics.summary import write_csv
-from nerfdiff.results.files import atomic
+from nerfdiff.utils.files import atomic
 
 TRACE = "trace.csv"
 PLOT = "trace.png"

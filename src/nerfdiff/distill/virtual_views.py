@@ -10,11 +10,11 @@ from torch import Tensor
 from nerfdiff.cameras import Cameras
 from nerfdiff.diffusion.deep_features import DeepFeatures, DeepReuse
 from nerfdiff.diffusion.denoiser import Condition
-from nerfdiff.errors import ConfigError
 from nerfdiff.field.encoder import Encoding
 from nerfdiff.model import NerfDiff
-from nerfdiff.randomness import generator
-from nerfdiff.results.timing import timed
+from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.randomness import generator
+from nerfdiff.utils.timing import timed
 
 Images = Float[Tensor, "views 3 height width"]
 

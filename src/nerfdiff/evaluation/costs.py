@@ -13,7 +13,7 @@ from nerfdiff.evaluation.subject import Subject
 from nerfdiff.field import cpu_field
 from nerfdiff.render import backend
 from nerfdiff.results.row import Timing
-from nerfdiff.results.timing import cost_of_a_piece, summarise
+from nerfdiff.utils.timing import cost_of_a_piece, summarise
 
 log = logging.getLogger(__name__)
 

@@ -22,9 +22,9 @@ from nerfdiff.distill.trace import TRACE, Step
 from nerfdiff.metrics.predictions import read_plan
 from nerfdiff.metrics.summary import IMAGE_METRICS, SCENE_METRICS
 from nerfdiff.results import tensorboard
-from nerfdiff.results.hashes import sha256_values
 from nerfdiff.results.row import ResultRow, flatten
 from nerfdiff.results.tensorboard import Layout
+from nerfdiff.utils.hashes import sha256_values
 
 log = logging.getLogger(__name__)
 

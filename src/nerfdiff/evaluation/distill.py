@@ -14,7 +14,6 @@ from lightning.fabric.strategies import DDPStrategy
 from omegaconf import DictConfig
 
 from nerfdiff.distill.strategy import Strategy
-from nerfdiff.errors import ConfigError, ProcessLost
 from nerfdiff.evaluation.dashboard import show_in_dashboard
 from nerfdiff.evaluation.evaluate import show
 from nerfdiff.evaluation.measure import measure, record_failure
@@ -24,7 +23,8 @@ from nerfdiff.evaluation.subject import Subject, choose_device, dataset_subject,
 from nerfdiff.processes import end_launched, lost_process, watch
 from nerfdiff.results.row import ResultRow
 from nerfdiff.stopping import Stopped
-from nerfdiff.training import plain
+from nerfdiff.utils.config import plain
+from nerfdiff.utils.errors import ConfigError, ProcessLost
 
 log = logging.getLogger(__name__)
 

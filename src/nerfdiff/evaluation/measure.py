@@ -16,16 +16,16 @@ from omegaconf import DictConfig
 from nerfdiff.cli import command_words
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.distill.strategy import Strategy
-from nerfdiff.errors import ConfigError, TimeUp, is_out_of_memory
 from nerfdiff.evaluation.costs import cost_fields, model_fields
 from nerfdiff.evaluation.dashboard import show_in_dashboard
 from nerfdiff.evaluation.subject import Subject, choose_device
 from nerfdiff.metrics.predictions import NonFinitePrediction
 from nerfdiff.metrics.score import Scorer, truth_from
 from nerfdiff.results.environment import environment
-from nerfdiff.results.hashes import sha256_values
 from nerfdiff.results.row import ResultRow, append_row
-from nerfdiff.training import plain
+from nerfdiff.utils.config import plain
+from nerfdiff.utils.errors import ConfigError, TimeUp, is_out_of_memory
+from nerfdiff.utils.hashes import sha256_values
 
 log = logging.getLogger(__name__)
 

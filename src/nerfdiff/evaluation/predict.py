@@ -13,19 +13,19 @@ from typing import Any
 
 import torch
 
-from nerfdiff.cpu_memory import peak_memory
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.distill.field_file import FIELD, SavedField, load_field, save_field
 from nerfdiff.distill.strategy import Strategy, Views
 from nerfdiff.distill.trace import PLOT, TRACE, plot_trace, write_trace
-from nerfdiff.errors import ConfigError, TimeUp, some
 from nerfdiff.evaluation.progress import SceneProgress
 from nerfdiff.evaluation.subject import Subject
+from nerfdiff.fit.saved_field import FIELD, SavedField, load_field, save_field
 from nerfdiff.metrics.image import psnr
 from nerfdiff.metrics.predictions import SCENE, PredictionWriter
-from nerfdiff.orbit import orbit
 from nerfdiff.results.pictures import orbit_video
-from nerfdiff.results.timing import PartClock, Stopwatch
+from nerfdiff.trajectories import orbit
+from nerfdiff.utils.errors import ConfigError, TimeUp, some
+from nerfdiff.utils.memory import peak_memory
+from nerfdiff.utils.timing import PartClock, Stopwatch
 
 ORBIT = "orbit.mp4"
 

@@ -11,8 +11,8 @@ from lightning import Callback
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from nerfdiff.callbacks.distillation_bar import DistillationBar
-from nerfdiff.callbacks.progress import duration
+from nerfdiff.evaluation.distillation_bar import DistillationBar
+from nerfdiff.training.callbacks.progress import duration
 
 log = logging.getLogger(__name__)
 

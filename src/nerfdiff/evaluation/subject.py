@@ -16,11 +16,11 @@ from nerfdiff.compilation import compile_unets
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.diffusion.layout import channels_last
-from nerfdiff.errors import ConfigError
 from nerfdiff.model import NerfDiff
 from nerfdiff.results.environment import hardware
-from nerfdiff.results.hashes import sha256_file, sha256_values
-from nerfdiff.training import auto_precision, plain
+from nerfdiff.utils.config import auto_precision, plain
+from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.hashes import sha256_file, sha256_values
 
 log = logging.getLogger(__name__)
 

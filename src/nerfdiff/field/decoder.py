@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfdiff.precision import at_least_single
+from nerfdiff.utils.precision import at_least_single
 
 
 class Decoder(nn.Module):

@@ -8,11 +8,11 @@ from torch import Tensor, nn
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.diffusion.unet import Context, UNet
-from nerfdiff.errors import ConfigError
 from nerfdiff.field.pixel_features import PixelFeatures
 from nerfdiff.field.resnet import ResNetPyramid
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.field.vision_features import VisionFeatures
+from nerfdiff.utils.errors import ConfigError
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 
-from nerfdiff.errors import ConfigError
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.encoder import Encoder, PixelEncoder
 from nerfdiff.field.residual_mlp import ResidualMLP
 from nerfdiff.field.resnet import ResNetPyramid
 from nerfdiff.field.vision_features import VisionFeatures
+from nerfdiff.utils.errors import ConfigError
 
 TRIPLANE, PIXELNERF, VISIONNERF = FIELDS = ("triplane", "pixelnerf", "visionnerf")
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nerfdiff.cameras import Cameras, along_axes
 from nerfdiff.field.frustum import frustum_coordinates
-from nerfdiff.precision import at_least_single, full_precision
+from nerfdiff.utils.precision import at_least_single, full_precision
 
 
 @dataclass(frozen=True)

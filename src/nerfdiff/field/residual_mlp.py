@@ -6,9 +6,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfdiff.diffusion.blocks import zero
-from nerfdiff.errors import ConfigError
 from nerfdiff.field.decoder import activated
-from nerfdiff.precision import full_precision
+from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.precision import full_precision
 
 
 class ResidualBlock(nn.Module):

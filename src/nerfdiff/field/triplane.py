@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.field.frustum import frustum_coordinates
-from nerfdiff.precision import at_least_single, full_precision
+from nerfdiff.utils.precision import at_least_single, full_precision
 
 # Which of (x̃, ỹ, z̃) runs along the (width, height) of each plane: W_xy, W_xz, W_yz.
 # W_yz keeps y along its height, as W_xy does.

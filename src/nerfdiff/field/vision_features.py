@@ -7,9 +7,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfdiff.errors import ConfigError
 from nerfdiff.field.resnet import check_groups, he_convolutions, residual_stage, side_by_side
 from nerfdiff.field.vision_transformer import VisionTransformer
+from nerfdiff.utils.errors import ConfigError
 
 
 class Reassembled(nn.Module):

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfdiff.errors import ConfigError
+from nerfdiff.utils.errors import ConfigError
 
 Tokens = Float[Tensor, "batch tokens width"]
 

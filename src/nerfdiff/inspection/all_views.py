@@ -5,10 +5,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from nerfdiff.data.bounds import Gaze
+from nerfdiff.data.readers.bounds import Gaze
 from nerfdiff.data.scene import Listing
-from nerfdiff.errors import DataError, some
 from nerfdiff.inspection.check import Finding
+from nerfdiff.utils.errors import DataError, some
 
 
 def refuse_missing_files(listing: Listing) -> None:

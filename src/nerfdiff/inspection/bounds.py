@@ -12,7 +12,7 @@ from nerfdiff.data.scene import Scene
 from nerfdiff.inspection.camera_checks import turn
 from nerfdiff.inspection.check import Finding
 from nerfdiff.metrics.depth import z_depth
-from nerfdiff.orbit import look_at_point
+from nerfdiff.trajectories import look_at_point
 
 
 def ray_distance(depth: Float[Tensor, "views h w"], cameras: Cameras) -> Float[Tensor, "views h w"]:

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from nerfdiff.results.files import atomic
 from nerfdiff.results.text import figure_text
+from nerfdiff.utils.files import atomic
 
 INSIDE, OUTSIDE = "#4c78a8", "#d62728"
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.scene import Scene
 from nerfdiff.inspection.check import Finding
-from nerfdiff.orbit import look_at_point
+from nerfdiff.trajectories import look_at_point
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.inspection.camera_checks import turn
-from nerfdiff.orbit import look_at_point
-from nerfdiff.results.files import atomic
 from nerfdiff.results.text import figure_text
+from nerfdiff.trajectories import look_at_point
+from nerfdiff.utils.files import atomic
 
 CAMERA, INPUT, LOOK, UP = "#44546a", "#d6278f", "#a9b4c0", "#e08a00"
 WORLD = ("#d62728", "#2ca02c", "#1f5fd0")

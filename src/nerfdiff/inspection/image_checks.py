@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from nerfdiff.data.masks import likely_misreading
+from nerfdiff.data.readers.masks import likely_misreading
 from nerfdiff.data.scene import Scene
-from nerfdiff.errors import some
 from nerfdiff.inspection.check import Finding
+from nerfdiff.utils.errors import some
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.data.scene import MissingSplit, SceneReader
-from nerfdiff.errors import DataError
 from nerfdiff.inspection.all_views import StrayCameras
 from nerfdiff.inspection.bounds_plot import Distances, write_bounds_plot
 from nerfdiff.inspection.camera_plot import PlottedCameras, write_camera_plot
@@ -20,6 +19,7 @@ from nerfdiff.inspection.report import print_report, write_report
 from nerfdiff.inspection.sheet import write_sheet
 from nerfdiff.inspection.summary import SplitSummary, summarise_split
 from nerfdiff.inspection.survey import Sample, SplitSurvey, sampled, survey_split
+from nerfdiff.utils.errors import DataError
 
 
 def inspect_data(cfg: DictConfig) -> list[SplitSummary]:

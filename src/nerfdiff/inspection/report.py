@@ -10,8 +10,8 @@ from rich.table import Table
 
 from nerfdiff.inspection.check import Status
 from nerfdiff.inspection.summary import SplitSummary
-from nerfdiff.results.files import write_text
 from nerfdiff.results.text import markdown_cell, one_line
+from nerfdiff.utils.files import write_text
 
 COLOURS = {Status.OK: "green", Status.FAILED: "bold red", Status.UNCHECKED: "yellow"}
 FACTS = ("split", "scenes", "views per scene", "read", "height x width", "focal length, px", "field of view, °",

@@ -9,14 +9,14 @@ from jaxtyping import Int64, UInt8
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras
-from nerfdiff.distill.inner_steps import InnerSteps
-from nerfdiff.distill.ray_batches import RayBatches
-from nerfdiff.distill.refined_field import RefinedField
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.triplane import Triplane
+from nerfdiff.fit.inner_steps import InnerSteps
+from nerfdiff.fit.ray_batches import RayBatches
+from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.metrics.image import dequantise, psnr
-from nerfdiff.randomness import generator
 from nerfdiff.render.renderer import Renderer
+from nerfdiff.utils.randomness import generator
 
 
 def evenly(count: int, limit: int) -> Int64[Tensor, "used"]:

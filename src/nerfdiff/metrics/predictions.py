@@ -26,9 +26,9 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from nerfdiff.errors import DataError
 from nerfdiff.metrics.image import quantise
-from nerfdiff.results.files import publish, remove_leftovers, write_text
+from nerfdiff.utils.errors import DataError
+from nerfdiff.utils.files import publish, remove_leftovers, write_text
 
 FORMAT = 2
 PLAN = "plan.json"

@@ -12,8 +12,7 @@ from rich.progress import track
 from torch import Tensor
 
 from nerfdiff.data.scene import Scene, SceneReader
-from nerfdiff.distill.field_file import FIELD
-from nerfdiff.errors import DataError
+from nerfdiff.fit.saved_field import FIELD
 from nerfdiff.metrics import depth as depth_metrics
 from nerfdiff.metrics import image as image_metrics
 from nerfdiff.metrics.consistency import Consistency
@@ -22,8 +21,8 @@ from nerfdiff.metrics.predictions import SCENE, Prediction, read_plan, read_pred
 from nerfdiff.metrics.sets import FrechetDistance, InceptionFeatures, inception_weights
 from nerfdiff.metrics.summary import IMAGE_METRICS, SCENE_METRICS, SceneScores, Value, summarise, write_csv
 from nerfdiff.metrics.whole_scene import Geometry, WholeScene
-from nerfdiff.results.files import write_text
-from nerfdiff.results.row import encode
+from nerfdiff.utils.errors import DataError
+from nerfdiff.utils.files import encode, write_text
 
 Truth = Callable[[str, Sequence[str]], Scene]
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
 
-from nerfdiff.results.files import atomic
+from nerfdiff.utils.errors import DataError
+from nerfdiff.utils.files import atomic
 
 IMAGE_METRICS = (
     "psnr",
@@ -21,6 +22,10 @@ IMAGE_METRICS = (
     "mask_iou",
 )
 SCENE_METRICS = ("floaters", "depth_extent", "consistency_psnr", "consistency_psnr_truth")
+
+FRECHET = ("fid", "fd_st_vgg")  # one number for all scenes of a run
+PER_SCENE = (*IMAGE_METRICS, *SCENE_METRICS)
+LARGEST = 2**21  # bytes of a file of scores: of some 10,000 scenes
 
 Value = float | int | str | None
 
@@ -97,3 +102,21 @@ def _mean(values: Sequence[float | None]) -> float | None:
     if not known:
         return None
     return math.nan if any(math.isnan(v) for v in known) else fmean(known)
+
+
+def read_scores(path: Path) -> dict[str, dict[str, float]]:
+    """What was measured of each scene: values by metric.
+
+    Raises:
+        DataError: the file is missing or damaged.
+    """
+    try:
+        if (size := path.stat().st_size) > LARGEST or not path.is_file():
+            raise ValueError(f"{size} bytes are too many" if path.is_file() else "no file")
+        with open(path, newline="", encoding="utf-8") as file:
+            return {
+                line["scene"]: {name: float(line[name]) for name in PER_SCENE if line.get(name)}
+                for line in csv.DictReader(file)
+            }
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        raise DataError(f"{path}: cannot be read ({error})") from error

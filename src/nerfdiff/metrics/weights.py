@@ -6,8 +6,8 @@ from pathlib import Path
 
 import torch
 
-from nerfdiff.errors import DataError
-from nerfdiff.results.hashes import sha256_file
+from nerfdiff.utils.errors import DataError
+from nerfdiff.utils.hashes import sha256_file
 
 log = logging.getLogger(__name__)
 

@@ -7,11 +7,11 @@ import torch
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.scene import Scene
-from nerfdiff.distill.field_file import load_field
+from nerfdiff.fit.saved_field import load_field
 from nerfdiff.metrics.consistency import Consistency, evenly
 from nerfdiff.metrics.geometry import depth_extent, floaters
 from nerfdiff.metrics.predictions import Prediction
-from nerfdiff.randomness import generator
+from nerfdiff.utils.randomness import generator
 
 
 @dataclass(frozen=True)

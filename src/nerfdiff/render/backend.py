@@ -12,11 +12,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfdiff.cameras import Rays
-from nerfdiff.errors import ConfigError
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.field import FieldFn, TriplaneField
 from nerfdiff.render.agreement import Probe, disagreement, in_any_order
 from nerfdiff.render.reference_gradients import reference_gradients
+from nerfdiff.utils.errors import ConfigError
 
 log = logging.getLogger(__name__)
 

@@ -12,10 +12,16 @@ from nerfdiff.cameras import Cameras, Rays
 from nerfdiff.errors import ConfigError
 from nerfdiff.field import cpu_field
 from nerfdiff.field.field import FieldFn, PixelField
-from nerfdiff.precision import full_precision
 from nerfdiff.render.backend import check_choice, fused
-from nerfdiff.render.compositing import compositing_weights
-from nerfdiff.render.sampling import KEPT, edges_between, importance_distances, in_bins, uniform_edges
+from nerfdiff.render.sampling import (
+    KEPT,
+    compositing_weights,
+    edges_between,
+    importance_distances,
+    in_bins,
+    uniform_edges,
+)
+from nerfdiff.utils.precision import full_precision
 
 CACHED_POINTS = 2**16
 """Points at once on a CPU, whatever `chunk` allows: more leave its caches, fewer cost more calls (measured)."""

@@ -1,13 +1,28 @@
-"""Where to look along a ray: uniform bins, then importance samples from what the bins showed."""
+"""Quadrature along a ray: uniform bins, importance samples from what they showed, and the weights of the integral."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
-from nerfdiff.precision import at_least_single
+from nerfdiff.utils.precision import at_least_single
 
 KEPT = torch.float16
 """Of weights that are kept for later: there are many of them, and samples fall where they do by chance anyway."""
+
+
+def compositing_weights(
+    density: Float[Tensor, "*rays samples"], lengths: Float[Tensor, "*rays samples"]
+) -> Float[Tensor, "*rays samples"]:
+    """ω_i = T_i (1 − exp(−σ_i δ_i)), T_i = exp(−Σ_{j<i} σ_j δ_j) (paper, eq. "nerf").
+
+    fp32 throughout, with T as the exponential of an exclusive cumulative sum: a bf16 cumulative product of many
+    nearly transparent samples stays at 1.
+    """
+    optical = at_least_single(density) * at_least_single(lengths)
+    # shifted: a sum less its last term has lost what came before a much larger one
+    before = pad(optical.cumsum(-1)[..., :-1], (1, 0))
+    return torch.exp(-before) * -torch.expm1(-optical)
 
 
 def uniform_edges(near: Float[Tensor, "*rays"], far: Float[Tensor, "*rays"], n: int) -> Float[Tensor, "*rays {n}+1"]:

@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from nerfdiff.errors import DataError
+from nerfdiff.metrics.summary import FRECHET, PER_SCENE, read_scores
 from nerfdiff.results.inside import inside
 from nerfdiff.results.intervals import Bootstrap, Estimate, spread
-from nerfdiff.results.row import ResultRow, RowFile, flatten
-from nerfdiff.results.sweep_jobs import RESULTS
-from nerfdiff.results.sweep_lines import FRECHET, PER_SCENE, read_scores
+from nerfdiff.results.row import RESULTS, ResultRow, RowFile, flatten
+from nerfdiff.utils.errors import DataError
 
 log = logging.getLogger(__name__)
 

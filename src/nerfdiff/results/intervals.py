@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nerfdiff.errors import ConfigError
+from nerfdiff.utils.errors import ConfigError
 
 
 class Estimate(NamedTuple):

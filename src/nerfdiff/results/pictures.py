@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from nerfdiff.metrics.image import quantise
-from nerfdiff.results.files import atomic
+from nerfdiff.utils.files import atomic
 
 INK, PAPER = (30, 30, 30), (255, 255, 255)
 

@@ -11,20 +11,21 @@ import json
 import logging
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
 from dataclasses import field as has
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any, get_args
 
-from nerfdiff.errors import DataError, some
+from nerfdiff.utils.errors import DataError, some
+from nerfdiff.utils.files import NONFINITE, encode
 
 log = logging.getLogger(__name__)
 
 SCHEMA_VERSION = 2
+RESULTS = "results.jsonl"
 STATUSES = ("ok", "nan", "oom", "diverged", "error", "timeout")
-NONFINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
 LARGEST = 1e100  # number, if finite
 LONGEST = 2**20  # bytes of a line
@@ -142,17 +143,6 @@ class ResultRow:
             raise ValueError(f"status {self.status!r} is unknown; choose one of {', '.join(STATUSES)}")
         if self.time is None:
             self.time = datetime.now(UTC).isoformat(timespec="seconds")
-
-
-def encode(value: Any) -> Any:
-    """`value` with non-finite floats as strings, so that it is valid JSON."""
-    if isinstance(value, Mapping):
-        return {key: encode(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [encode(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
-    return value
 
 
 def append_row(path: str | Path, row: ResultRow) -> None:

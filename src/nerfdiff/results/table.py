@@ -8,9 +8,9 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from nerfdiff.results.files import write_text
 from nerfdiff.results.row import ResultRow, flatten
 from nerfdiff.results.text import markdown_lines, one_line
+from nerfdiff.utils.files import write_text
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
-from nerfdiff.errors import UserError
+from nerfdiff.utils.errors import UserError
 
 log = logging.getLogger(__name__)
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, fields
 from statistics import fmean
 from typing import TYPE_CHECKING
 
-from nerfdiff.errors import ConfigError
 from nerfdiff.results.row import ResultRow
 from nerfdiff.sweeps.proposals import Tried
 from nerfdiff.sweeps.space import Axis, Configuration, Space
+from nerfdiff.utils.errors import ConfigError
 
 if TYPE_CHECKING:
     import optuna

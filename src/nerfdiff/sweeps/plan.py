@@ -4,8 +4,8 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from nerfdiff.errors import DataError
-from nerfdiff.results.files import write_text
+from nerfdiff.utils.errors import DataError
+from nerfdiff.utils.files import write_text
 
 PLAN = "plan.json"
 

@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from nerfdiff.errors import ConfigError
 from nerfdiff.results.row import ResultRow
 from nerfdiff.sweeps.space import Configuration, Space
+from nerfdiff.utils.errors import ConfigError
 
 Tried = Mapping[Configuration, Sequence[ResultRow]]
 """The newest row of each seed with which a configuration was run."""

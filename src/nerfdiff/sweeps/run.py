@@ -12,13 +12,13 @@ from hydra.errors import CompactHydraException
 from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig, open_dict
 
-from nerfdiff.results.hashes import sha256_values
-from nerfdiff.results.row import ResultRow, RowFile
-from nerfdiff.results.sweep_jobs import RESULTS, results_of
+from nerfdiff.results.row import RESULTS, ResultRow, RowFile
+from nerfdiff.sweeps.jobs import results_of
 from nerfdiff.sweeps.plan import write_plan
 from nerfdiff.sweeps.proposals import Proposals
 from nerfdiff.sweeps.space import Configuration, Space
 from nerfdiff.sweeps.task import Task
+from nerfdiff.utils.hashes import sha256_values
 
 log = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from omegaconf import DictConfig
 
-from nerfdiff.cpu_memory import forget_peak_memory, keep_freed_memory
+from nerfdiff.utils.memory import forget_peak_memory, keep_freed_memory
 
 log = logging.getLogger(__name__)
 

@@ -1,0 +1,146 @@
+"""The inner steps of distillation: a field fitted to images on random rays (Algorithm 1's last lines)."""
+
+import logging
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfdiff.fit.ray_batches import RayBatches
+from nerfdiff.fit.refined_field import RefinedField
+from nerfdiff.render.renderer import Renderer
+from nerfdiff.utils.errors import OutOfMemory, size_text
+from nerfdiff.utils.memory import free_memory
+
+log = logging.getLogger(__name__)
+
+WARM_UP = 3
+"""Steps before one is recorded: kernels are chosen and Adam's state is made in the first."""
+
+
+class InnerSteps:
+    """Steps of an optimizer on rays drawn over all views of each scene.
+
+    All that is random is drawn before the first step, and nothing in between waits for the device: on a GPU a step
+    is recorded once as a CUDA graph and replayed, since launching its kernels takes longer than they do.
+
+    Args:
+        field: of one or several scenes; each fits its own part of it, whatever the others do.
+        renderer: that shows it.
+        batches: rays and colours; and, where they are remembered, the coarse weights that importance samples are drawn
+            from instead of new ones.
+        optimizer: of the field's parameters; `capturable` where steps are to be recorded.
+        rays: B, per step and scene.
+        generators: one per scene, so that a scene's rays do not depend on its company.
+        record: replay a CUDA graph, on a GPU.
+    """
+
+    recording = True
+    """Whether this process can record: what failed once is not tried again for every scene."""
+
+    def __init__(
+        self,
+        field: RefinedField,
+        renderer: Renderer,
+        batches: RayBatches,
+        optimizer: torch.optim.Optimizer,
+        rays: int,
+        generators: Sequence[torch.Generator],
+        record: bool,
+    ):
+        self.field, self.renderer, self.batches, self.optimizer = field, renderer, batches, optimizer
+        self.rays, self.generators = rays, generators
+        self._record = record and InnerSteps.recording and field.planes.device.type == "cuda"
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._steps: int | None = None
+
+    @property
+    def queries(self) -> int:
+        """Points of one scene at which a step evaluates its field."""
+        return self.rays * self.renderer.samples_per_ray
+
+    @property
+    def recorded(self) -> bool:
+        """Whether steps are replayed from a CUDA graph."""
+        return self._graph is not None
+
+    def run(self, steps: int) -> Float[Tensor, "{steps} scenes"]:
+        """Take `steps` steps; the mean squared error of each, before it."""
+        self._draw(steps)
+        taken = 0
+        if self._record and self._graph is None and steps > WARM_UP:
+            taken = self._warm_up()
+            self._try_to_record()
+        for _ in range(taken, steps):
+            self._step() if self._graph is None else self._graph.replay()
+        return self._losses.clone()
+
+    def _draw(self, steps: int) -> None:
+        """Which rays, and where on them: into the same memory every time, which a recorded step reads."""
+        scenes, per_scene = self.batches.shape
+        device = self.field.planes.device
+        if steps != self._steps:
+            self._require_memory(steps * scenes * self.rays * (8 + 4 * self.renderer.samples_per_ray), device)
+            self._steps, self._graph = steps, None
+            self._picked = torch.empty(scenes, steps, self.rays, dtype=torch.long, device=device)
+            self._jitter = torch.empty(scenes, steps, self.rays, self.renderer.samples_per_ray, device=device)
+            self._losses = torch.empty(steps, scenes, device=device)
+            self._number = torch.zeros(1, dtype=torch.long, device=device)
+        for scene, source in enumerate(self.generators):
+            self._picked[scene].random_(per_scene, generator=source)
+            self._jitter[scene].uniform_(generator=source)
+        self._number.zero_()
+
+    def _require_memory(self, needed: int, device: torch.device) -> None:
+        """Before the system kills a process that it promised more than there is."""
+        free = free_memory(device)
+        if needed > free:
+            raise OutOfMemory(
+                f"{self.rays} rays a step take {size_text(needed)} for the numbers that are drawn alone, and "
+                f"{device.type} has {size_text(free)} free: lower budget.rays, budget.inner_steps or scenes_at_once"
+            )
+
+    def _step(self) -> None:
+        """The step whose number is on the device."""
+        picked, jitter = (drawn.index_select(1, self._number)[:, 0] for drawn in (self._picked, self._jitter))
+        rays, colours = self.batches.at(picked)
+        rgb = self.renderer.render(self.field.field(), rays, jitter, self.batches.coarse_at(picked)).rgb
+        losses = F.mse_loss(rgb, colours, reduction="none").mean((1, 2))
+        self.optimizer.zero_grad()
+        losses.sum().backward()  # each scene's gradient is that of its own loss
+        self.optimizer.step()
+        self._losses.index_copy_(0, self._number, losses.detach()[None])
+        self._number += 1
+
+    def _warm_up(self) -> int:
+        """The first steps, on a stream of their own, as CUDA graphs ask; how many."""
+        here, aside = torch.cuda.current_stream(), torch.cuda.Stream()
+        aside.wait_stream(here)
+        with torch.cuda.stream(aside):
+            for _ in range(WARM_UP):
+                self._step()
+        here.wait_stream(aside)
+        return WARM_UP
+
+    def _try_to_record(self) -> None:
+        graph = torch.cuda.CUDAGraph()
+        try:
+            self.optimizer.zero_grad()
+            # the inner context would not give the stream back where the end of recording fails
+            # other threads may go on allocating, as those that pin a loader's batches do
+            with (
+                torch.cuda.stream(torch.cuda.current_stream()),
+                torch.cuda.graph(graph, capture_error_mode="thread_local"),
+            ):
+                self._step()
+        except RuntimeError as error:
+            lines = str(error).splitlines()
+            log.warning("inner steps are not replayed from a CUDA graph: %s", lines[0] if lines else "no message")
+            self._record = False
+            # memory that ran out says nothing of the next scene; the end of recording may raise something of its own
+            if not any(isinstance(e, torch.OutOfMemoryError) for e in (error, error.__context__)):
+                InnerSteps.recording = False
+            return
+        self._graph = graph

@@ -1,0 +1,93 @@
+"""A refined field on disk: safetensors, with the camera it lives in and all else that rendering it takes."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from nerfdiff.cameras import Cameras
+from nerfdiff.field.decoder import Decoder
+from nerfdiff.field.triplane import Triplane
+from nerfdiff.fit.refined_field import RefinedField
+from nerfdiff.render.renderer import Renderer
+from nerfdiff.utils.errors import DataError
+from nerfdiff.utils.files import atomic
+
+FIELD = "field.safetensors"
+FORMAT = 1
+MACHINES = ("backend", "kernel_precision")
+"""Settings of the renderer that suit a machine, not a field."""
+
+
+@dataclass(frozen=True)
+class SavedField:
+    """A field and the renderer it was fitted with.
+
+    Args:
+        field: on the CPU, of one scene.
+        renderer: its samples per ray, background and chunk.
+    """
+
+    field: RefinedField
+    renderer: Renderer
+
+
+def save_field(path: str | Path, saved: SavedField) -> None:
+    """Write planes and decoder as float32, and the rest as JSON in the file's header (key `nerfdiff`).
+
+    Raises:
+        DataError: the file cannot be written.
+    """
+    field = saved.field
+    header = {
+        "format": FORMAT,
+        "camera": {"K": field.cameras.K[0].tolist(), "height": field.cameras.height, "width": field.cameras.width},
+        "near": float(field.near),
+        "far": float(field.far),
+        "decoder": field.decoder.settings,
+        "render": {name: value for name, value in asdict(saved.renderer).items() if name not in MACHINES},
+    }
+    state = {name: value.detach().cpu().contiguous() for name, value in field.state_dict().items()}
+    header["sha256"] = _digest(state)
+    with atomic(Path(path)) as temporary:
+        save_file(state, temporary, {"nerfdiff": json.dumps(header)})
+
+
+def load_field(path: str | Path) -> SavedField:
+    """Read what `save_field` wrote; needs no checkpoint.
+
+    Raises:
+        DataError: the file is missing, damaged, or something else.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads(file.metadata()["nerfdiff"])
+            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, it is no mapping
+        if header["format"] != FORMAT:
+            raise DataError(f"{path}: format {header['format']!r}, expected {FORMAT}; distil the scene again")
+        if header.get("sha256", digest := _digest(state)) != digest:  # fields from before have none
+            raise DataError(f"{path}: its bytes changed since it was written; copy it anew, or distil the scene again")
+        camera = header["camera"]
+        cameras = Cameras(torch.eye(4)[None], torch.tensor([camera["K"]]), camera["height"], camera["width"])
+        bounds = (torch.tensor([header[name]]) for name in ("near", "far"))
+        field = RefinedField(Triplane(state["planes"], cameras, *bounds), Decoder(**header["decoder"]))
+        field.load_state_dict(state)
+        return SavedField(field, Renderer(**header["render"]))
+    except DataError:
+        raise
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise DataError(
+            f"{path}: not a field saved by this project ({type(error).__name__}: {error}); distil the scene again"
+        ) from error
+
+
+def _digest(state: Mapping[str, torch.Tensor]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(state):
+        digest.update(state[name].numpy())
+    return digest.hexdigest()

@@ -1,0 +1,232 @@
+"""One training run, from a composed config to a model on disk."""
+
+import logging
+import os
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from lightning import Trainer, seed_everything
+from omegaconf import DictConfig
+
+from nerfdiff.checkpoint import (
+    DAMAGED,
+    check_finite,
+    check_resumable,
+    check_same_data,
+    describe,
+    differences,
+    export_model,
+    last_checkpoint,
+    load_model,
+    read_checkpoint,
+)
+from nerfdiff.compilation import compile_unets
+from nerfdiff.data.datamodule import SceneDataModule
+from nerfdiff.diffusion.layout import channels_last
+from nerfdiff.diffusion.unet import AUTO
+from nerfdiff.inputs import LAST, find_weights
+from nerfdiff.processes import lost_process, watch
+from nerfdiff.stopping import Stopped
+from nerfdiff.training.callbacks.checkpoint import ClearCheckpointIO
+from nerfdiff.training.callbacks.record import Record
+from nerfdiff.training.memory import WEIGHTS_ADAM_EMA, is_tight, within_memory
+from nerfdiff.training.module import NerfDiffModule
+from nerfdiff.utils.config import auto_precision, plain
+from nerfdiff.utils.errors import CheckpointError, ConfigError, ProcessLost, TrainingDiverged
+from nerfdiff.utils.files import held, remove_leftovers
+from nerfdiff.utils.hashes import sha256_file, sha256_values
+
+log = logging.getLogger(__name__)
+
+
+def train(cfg: DictConfig) -> dict[str, float]:
+    """Train, or go on training, the run of `cfg.paths.output_dir`.
+
+    Leaves there `checkpoints/last.ckpt` and `best.ckpt`, `model/` (averaged weights as safetensors with their
+    settings), `previews/` and TensorBoard logs.
+
+    Returns:
+        the last logged metrics.
+
+    Raises:
+        UserError: bad data, config, checkpoint, or a run that diverged; the message says what to do.
+    """
+    watch()
+    # Seeds the initial weights, and dropout where a model has it. All other randomness is a function of cfg.seed and
+    # the draw (nerfdiff.utils.randomness), which a resumed run takes up where it was.
+    seed_everything(cfg.seed, verbose=False)
+    if cfg.threads is not None:
+        torch.set_num_threads(cfg.threads)
+    trainer = build_trainer(cfg)
+    with held(Path(cfg.paths.output_dir)) if trainer.is_global_zero else nullcontext():
+        return _train(cfg, trainer)
+
+
+def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
+    output_dir = Path(cfg.paths.output_dir)
+    if trainer.is_global_zero:
+        for folder in (output_dir, *(output_dir / name for name in ("checkpoints", "model", "previews", "snapshots"))):
+            remove_leftovers(folder)
+    model_config = plain(cfg.model) | {"conditioning": plain(cfg.conditioning)}
+    datamodule = instantiate(cfg.data)
+    last = _checkpoint_to_resume(output_dir, cfg, model_config, datamodule)
+    model_config = _within_memory(model_config, trainer, datamodule)
+    module = NerfDiffModule(
+        model=model_config,
+        losses=plain(cfg.losses),
+        optimizer=plain(cfg.optimizer),
+        validation_times=plain(cfg.validation_times),
+        channels_last=channels_last(cfg.channels_last, trainer.strategy.root_device, cfg.compile != "none"),
+        seed=cfg.seed,
+        kept_renderings=_kept_renderings(cfg, datamodule),
+    )
+    if last is None:
+        _begin(module, cfg, model_config)
+    module.model.renderer = replace(module.model.renderer, backend=cfg.backend, kernel_precision=cfg.kernel_precision)
+    compile_unets(module.model, cfg.compile, cfg.paths.compiled_dir)
+    _announce(module, last, trainer.strategy.root_device)
+    if trainer.is_global_zero and last is not None and last.name != LAST and (last.parent / LAST).exists():
+        os.replace(last.parent / LAST, last.parent / DAMAGED)  # else it would take the place of the one that is good
+
+    try:
+        trainer.fit(module, datamodule, ckpt_path=last, weights_only=True)
+    except Stopped as stopped:
+        raise Stopped(stopped.signum, describe(last_checkpoint(output_dir))) from None
+    except TrainingDiverged as error:
+        raise TrainingDiverged(f"{error}. {_sound(output_dir)}") from error
+    except RuntimeError as error:
+        if trainer.world_size == 1 or not (sentence := lost_process(error)):
+            raise
+        raise ProcessLost(f"{sentence} {describe(last_checkpoint(output_dir))} The same command goes on") from error
+
+    if trainer.is_global_zero:
+        # From the file, not the module: resuming a run that is complete leaves raw weights in the module.
+        weights = "ema" if cfg.callbacks.get("ema") else "raw"
+        loaded = load_model(last_checkpoint(output_dir), weights, cfg.paths.assets_dir)
+        path = export_model(loaded, output_dir / "model", torch.float32)
+        log.info("weights: %s", path)
+        log.info("previews: %s   curves: tensorboard --logdir %s", output_dir / "previews", output_dir)
+    return {name: float(value) for name, value in trainer.callback_metrics.items()}
+
+
+def _begin(module: NerfDiffModule, cfg: DictConfig, model_config: dict) -> None:
+    """Give a new run the weights of `cfg.init`."""
+    if cfg.init is None:
+        if module.frozen_field:
+            raise ConfigError("losses.lambda_ic=0 trains the CDM on a field that stays as it is: set init=<checkpoint>")
+        return
+    begun = load_model(cfg.init, "ema", cfg.paths.assets_dir)
+    try:
+        module.model.load_state_dict(begun.model.state_dict())
+    except RuntimeError as error:  # of other names or sizes
+        changed = "; ".join(differences(begun.config, model_config, "model."))
+        raise CheckpointError(f"init={cfg.init} does not fit this run's model ({changed}): use its settings") from error
+    module.trained_before, module.begun_from = list(begun.trained_on), sha256_file(begun.path)
+
+
+def _kept_renderings(cfg: DictConfig, data: SceneDataModule) -> str | None:
+    """The folder for a frozen field's renderings: its name says how which data are rendered."""
+    if not cfg.kept_renderings:
+        return None
+    if data.source_target_noise:
+        raise ConfigError(
+            f"kept_renderings are of the views' own cameras, and data.source_target_noise={data.source_target_noise} "
+            "moves some of these at every step: set it to 0, or kept_renderings to null"
+        )
+    reader = data.reader("train")
+    what = [plain(cfg.model.render), reader.identity, reader.fingerprint()]
+    return str(Path(cfg.kept_renderings) / sha256_values(what)[:12])
+
+
+def _within_memory(model_config: dict, trainer: Trainer, data: SceneDataModule) -> dict:
+    device = trainer.strategy.root_device
+    if model_config["unet"]["checkpointing"] != AUTO and not is_tight(model_config, device):
+        return model_config
+    first = data.reader("train").load(0, [0]).cameras
+    batch_size = max(1, data.batch_size // (trainer.world_size * trainer.accumulate_grad_batches))
+    size = first.height, first.width
+    return within_memory(model_config, device, batch_size, data.target_views, *size, trainer.precision)
+
+
+def build_trainer(cfg: DictConfig) -> Trainer:
+    """The Lightning Trainer of a composed training config."""
+    options: dict[str, Any] = {}
+    if cfg.trainer.precision == "auto":
+        options["precision"] = auto_precision(cfg.trainer.accelerator)
+    logger = cfg.get("logger")
+    # Without a logger there is nowhere to write the learning rate to.
+    wanted = {name: node for name, node in cfg.callbacks.items() if logger or name != "learning_rate"}
+    try:
+        return instantiate(
+            cfg.trainer,
+            logger=instantiate(logger) if logger else False,
+            callbacks=[
+                Record(cfg, Path(cfg.paths.output_dir) / "config.yaml"),  # first: others read it
+                *(instantiate(callback) for callback in wanted.values() if callback is not None),
+            ],
+            enable_progress_bar=cfg.callbacks.get("progress") is not None,
+            plugins=[ClearCheckpointIO()],
+            # Lightning counts batches where we count optimizer steps.
+            val_check_interval=cfg.validation_every * cfg.trainer.accumulate_grad_batches,
+            check_val_every_n_epoch=None,
+            **options,
+        )
+    except InstantiationException as error:
+        raise ConfigError(f"the trainer cannot be set up: {error.__cause__ or error}") from error
+
+
+def _checkpoint_to_resume(output_dir: Path, cfg: DictConfig, model_config: dict, data: SceneDataModule) -> Path | None:
+    last = last_checkpoint(output_dir)
+    if not last.is_file():
+        return None
+    if not cfg.resume:
+        raise CheckpointError(
+            f"{output_dir} holds the checkpoint of an earlier run and resume=false: choose another run_name, or "
+            "delete that folder"
+        )
+    check_resumable(last, model_config, cfg.trainer.accumulate_grad_batches)
+    try:
+        check_same_data(last, data.state_dict())
+    except CheckpointError as error:
+        if not cfg.other_data:
+            raise
+        log.warning("%s", error)
+    begun_from = read_checkpoint(last).get("begun_from")
+    if cfg.init is not None and begun_from is not None:
+        init = find_weights(cfg.init, cfg.paths.assets_dir)
+        if sha256_file(init) != begun_from:
+            raise CheckpointError(
+                f"the run of {last} began with other weights than init={cfg.init} has now ({init}): choose another "
+                "run_name to start afresh with these, or leave init out to go on"
+            )
+    return last
+
+
+def _sound(output_dir: Path) -> str:
+    """What is left of a run that diverged."""
+    last = last_checkpoint(output_dir)
+    if not last.is_file():
+        return "No checkpoint is from before that: start afresh"
+    try:
+        check_finite(last)
+    except CheckpointError as error:
+        return f"{error}: start afresh"
+    return f"{describe(last)} Its weights are finite: the same command goes on from there"
+
+
+def _announce(module: NerfDiffModule, last: Path | None, device: torch.device) -> None:
+    counts = module.model.parameter_count()
+    state = WEIGHTS_ADAM_EMA * counts["total"] / 2**30
+    log.info(
+        "%s/%s: %.1fM parameters (encoder %.1fM, CDM %.1fM); weights, Adam and EMA take %.2f GiB",
+        module.model.name,
+        module.model.conditioning,
+        *(counts[part] / 1e6 for part in ("total", "encoder", "denoiser")),
+        state,
+    )
+    log.info("%s on %s", f"resuming from {last}" if last else "starting afresh", device)

@@ -9,7 +9,6 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from nerfdiff.cameras import Cameras, Rays
-from nerfdiff.errors import ConfigError
 from nerfdiff.field import cpu_field
 from nerfdiff.field.field import FieldFn, PixelField
 from nerfdiff.render.backend import check_choice, fused
@@ -21,6 +20,7 @@ from nerfdiff.render.sampling import (
     in_bins,
     uniform_edges,
 )
+from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.precision import full_precision
 
 CACHED_POINTS = 2**16

@@ -6,7 +6,7 @@ import triton
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfdiff.precision import full_precision
+from nerfdiff.utils.precision import full_precision
 
 MOST = 2.0**14
 """Of a texel in fp16: three of them are summed, and no more than 65504 can be."""

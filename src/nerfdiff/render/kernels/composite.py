@@ -11,26 +11,34 @@ from nerfdiff.render.kernels.samples import absorbed, four, store_four, store_ve
 @triton.jit
 @no_type_check
 def start(distances, uniform, drawn, row):
-    """Where a walk over both lists begins: the next place in each, and the next distance of each."""
-    none = tl.zeros(row.shape, tl.int32)
-    next_uniform = tl.load(distances, mask=row & (uniform > 0), other=float("inf"))
-    next_drawn = tl.load(distances + uniform, mask=row & (drawn > 0), other=float("inf"))
-    return none, none, next_uniform, next_drawn
+    """Where a walk over both lists begins: the next place in each, and the next two distances of each."""
+    none, second = tl.zeros(row.shape, tl.int32), tl.full(row.shape, 1, tl.int32)
+    return (
+        none,
+        none,
+        tl.load(distances, mask=row & (none < uniform), other=float("inf")),
+        tl.load(distances + 1, mask=row & (second < uniform), other=float("inf")),
+        tl.load(distances + uniform, mask=row & (none < drawn), other=float("inf")),
+        tl.load(distances + uniform + 1, mask=row & (second < drawn), other=float("inf")),
+    )
 
 
 @triton.jit
 @no_type_check
 def advance(distances, walk, uniform, drawn, row):
-    """The walk a sample further; that sample's place and distance, and the distance after it."""
-    u, d, next_uniform, next_drawn = walk
-    first = (d >= drawn) | ((u < uniform) & (next_uniform <= next_drawn))
-    slot, here = tl.where(first, u, uniform + d), tl.where(first, next_uniform, next_drawn)
+    """The walk a sample further; that sample's place and distance, and the distance after it.
+
+    What is read is needed two samples later at the earliest: nothing waits for it.
+    """
+    u, d, u_next, u_second, d_next, d_second = walk
+    first = (d >= drawn) | ((u < uniform) & (u_next <= d_next))
+    slot, here = tl.where(first, u, uniform + d), tl.where(first, u_next, d_next)
+    left = tl.where(first, u + 2 < uniform, d + 2 < drawn)
+    third = tl.load(distances + slot + 2, mask=row & left, other=float("inf"))
     u, d = tl.where(first, u + 1, u), tl.where(first, d, d + 1)
-    left = tl.where(first, u < uniform, d < drawn)
-    following = tl.load(distances + slot + 1, mask=row & left, other=float("inf"))
-    next_uniform = tl.where(first, following, next_uniform)
-    next_drawn = tl.where(first, next_drawn, following)
-    return (u, d, next_uniform, next_drawn), slot, here, tl.minimum(next_uniform, next_drawn)
+    u_next, u_second = tl.where(first, u_second, u_next), tl.where(first, third, u_second)
+    d_next, d_second = tl.where(first, d_next, d_second), tl.where(first, d_second, third)
+    return (u, d, u_next, u_second, d_next, d_second), slot, here, tl.minimum(u_next, d_next)
 
 
 @triton.jit(do_not_specialize=["n", "first", "count", "uniform", "samples"])
@@ -65,10 +73,13 @@ def composite_kernel(
     green = tl.zeros([R], tl.float32)
     blue = tl.zeros([R], tl.float32)
     walk = start(distances, uniform, drawn, here)
+    walk, slot, t, after = advance(distances, walk, uniform, drawn, here)
+    seen = four(values, row * samples + slot, here & (t <= stop))
     for i in range(samples):
-        walk, slot, t, after = advance(distances, walk, uniform, drawn, here)
+        r, g, b, density = seen
+        walk, slot, next_t, next_after = advance(distances, walk, uniform, drawn, here)
+        seen = four(values, row * samples + slot, here & (next_t <= stop) & (i < samples - 1))  # in advance
         next_edge = tl.where(i == samples - 1, end, 0.5 * (t + after))
-        r, g, b, density = four(values, row * samples + slot, here & (t <= stop))
         optical = density * (next_edge - edge)
         share = absorbed(optical)
         if OPAQUE:
@@ -80,7 +91,7 @@ def composite_kernel(
         green += weight * g
         blue += weight * b
         through *= tl.exp(-optical)
-        edge = next_edge
+        edge, t, after = next_edge, next_t, next_after
 
     behind = 0.0 if OPAQUE else (1.0 - total) * background
     store_vector(rgb, at, red + behind, green + behind, blue + behind, here)
@@ -132,11 +143,14 @@ def composite_gradient_kernel(
 
     through = tl.full([R], 1.0, tl.float32)
     walk = start(distances, uniform, drawn, here)
+    walk, slot, t, after = advance(distances, walk, uniform, drawn, here)
+    seen = four(values, row * samples + slot, here & (t <= stop))
     for i in range(samples):
-        walk, slot, t, after = advance(distances, walk, uniform, drawn, here)
+        red, green, blue, density = seen
+        walk, next_slot, next_t, next_after = advance(distances, walk, uniform, drawn, here)
+        seen = four(values, row * samples + next_slot, here & (next_t <= stop) & (i < samples - 1))  # in advance
         next_edge = tl.where(i == samples - 1, end, 0.5 * (t + after))
         length = next_edge - edge
-        red, green, blue, density = four(values, row * samples + slot, here & (t <= stop))
         optical = density * length
         share = absorbed(optical)
         if OPAQUE:
@@ -157,4 +171,4 @@ def composite_gradient_kernel(
         d_green = weight * g_green * green * (1.0 - green)
         d_blue = weight * g_blue * blue * (1.0 - blue)
         store_four(d_values, row * samples + slot, d_red, d_green, d_blue, d_density, here)
-        edge = next_edge
+        edge, slot, t, after = next_edge, next_slot, next_t, next_after

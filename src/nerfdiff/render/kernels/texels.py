@@ -29,7 +29,7 @@ def hidden_texels(
     with full_precision(planes.device):
         table = torch.baddbmm(bias[:, None], planes.float().flatten(0, 1).flatten(2).mT, weight.mT)
     if half:
-        table = table.clamp(-MOST, MOST).half()
+        table = table.clamp_(-MOST, MOST).half()
     return table.reshape(scenes, 3, height, width, -1)
 
 

@@ -15,7 +15,7 @@ BOUNDS = {"look, uniform": (60, 100), "look, drawn": (60, 90), "gradient": (100,
 """Of warp instructions for each point: sm_80 adds to memory number by number, and has the most of a gradient."""
 FRAME = 16
 """Bytes of a thread's stack where nothing is spilled, at most."""
-SPILLED = 192
+SPILLED = 512
 """Likewise in fp32 with everything asked for, and where a run's sums take up the registers."""
 
 

@@ -1,5 +1,6 @@
 """Random triplane fields and rays, rendered by the kernels and by the float64 reference."""
 
+import os
 import random
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,14 +15,16 @@ from nerfdiff.field.triplane import Triplane
 from nerfdiff.render.kernels import passes
 from nerfdiff.render.kernels.arguments import Bundle, Fields, Settings
 from nerfdiff.render.kernels.function import fused_render
+from nerfdiff.render.kernels.texels import hidden_texels
 from nerfdiff.render.renderer import Renderer
 from nerfdiff.render.sampling import KEPT
 
+os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # where a fixed order is asked of PyTorch
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 NAMES = ("planes", "w1", "b1", "w2", "b2", "origins", "directions")
 IMAGE = 18, 14  # width, height
 
-LAUNCHES = passes._coarse, passes._composite, passes._gradient
+LAUNCHES = passes._look, passes._gradient
 
 
 def without_trials(monkeypatch) -> None:
@@ -96,36 +99,37 @@ class Case:
         return Rays(*leaves[5:], self.ray_near.to(leaves[5]), self.ray_far.to(leaves[5]))
 
     def reference(self, distances: Tensor | None = None) -> tuple[list[Tensor], dict[str, Tensor]]:
-        """Outputs and gradients by the PyTorch renderer, in float64 on the CPU.
+        """Outputs and gradients by the PyTorch renderer, in float64.
 
         Args:
             distances: [scenes, n, samples], ascending; None leaves it to the renderer where to look.
         """
-        leaves = [leaf.double().requires_grad_() for leaf in self.leaves]
+        leaves = [leaf.to(DEVICE).double().requires_grad_() for leaf in self.leaves]
         field = self.field(leaves)
         decoder = (field.decoder.hidden.weight, field.decoder.hidden.bias)
         leaves[1:5] = *decoder, field.decoder.output.weight, field.decoder.output.bias
         rays = self.rays(leaves)
         if distances is None:
-            jitter = None if self.jitter is None else self.jitter.double()
-            out = self.renderer.render(field, rays, jitter, self.coarse)
+            jitter = None if self.jitter is None else self.jitter.to(DEVICE).double()
+            out = self.renderer.render(field, rays, jitter, None if self.coarse is None else self.coarse.to(DEVICE))
             outputs = [out.rgb, out.opacity, out.depth]
         else:
-            seen = self.renderer._query(field, rays, distances.double())
-            outputs = list(self.renderer._composite(rays, distances.double(), *seen))
+            distances = distances.to(DEVICE).double()
+            outputs = list(self.renderer._composite(rays, distances, *self.renderer._query(field, rays, distances)))
         return _with_gradients(outputs, leaves, self.d_outputs, NAMES)
 
-    def packed(self) -> tuple[Fields, Bundle]:
+    def packed(self, half: bool = False) -> tuple[Fields, Bundle]:
         """As kernels read them."""
-        planes, *decoder = (leaf.to(DEVICE) for leaf in self.leaves[:5])
-        frustum = (value.to(DEVICE) for value in (self.K, self.near, self.far))
+        table = hidden_texels(*(leaf.to(DEVICE) for leaf in self.leaves[:3]), half)
+        more = (value.to(DEVICE) for value in (self.K, self.near, self.far, *self.leaves[3:5]))
         rays = (*self.leaves[5:], self.ray_near, self.ray_far, self.jitter, self.coarse)
-        bundle = Bundle(*(None if value is None else value.to(DEVICE) for value in rays))
-        return Fields(planes.movedim(2, -1).contiguous(), *frustum, *decoder), bundle
+        return Fields(table, *more), Bundle(*(None if value is None else value.to(DEVICE) for value in rays))
 
-    def settings(self, precision: str = "ieee", ordered: bool = False, points: int = 10**6) -> Settings:
-        samples = self.uniform, self.importance, self.background
-        return Settings(*samples, points, points, precision, ordered, *IMAGE, self.shift, self.scale)
+    def settings(
+        self, half: bool = False, ordered: bool = False, points: int = 10**6, least_transmittance: float = 0.0
+    ) -> Settings:
+        samples, decoder = (self.uniform, self.importance, self.background), (self.shift, self.scale)
+        return Settings(*samples, points, points, half, ordered, *IMAGE, *decoder, least_transmittance)
 
     def render(self, leaves, settings: Settings, keep_coarse: bool = False):
         """Colour, opacity and depth by the kernels for these leaves; and coarse weights where they are to be kept."""
@@ -160,14 +164,14 @@ class Case:
 
 def drawn_case(draw: random.Random) -> Case:
     """Any shape out of the product of all, with inputs of its own."""
-    importance = draw.choice((0, 1, 2, 3, 5, 8, 13))
+    importance = draw.choice((0, 1, 2, 3, 5, 8))
     return Case(
         scenes=draw.randint(1, 3),
         n=draw.randint(1, 40),
         channels=draw.choice((1, 3, 8, 16, 17, 24)),
         hidden=draw.choice((1, 6, 16, 20, 33)),
         plane=(draw.randint(1, 9), draw.randint(1, 9)),
-        uniform=draw.choice((1, 2, 3, 5, 8, 11, 16)),
+        uniform=draw.choice((1, 2, 3, 5, 8)),
         importance=importance,
         background=draw.choice((None, 0.0, 0.4, 1.0)),
         jittered=draw.random() < 0.5,

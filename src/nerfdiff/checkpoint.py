@@ -273,7 +273,8 @@ def differences(old: Mapping, new: Mapping, prefix: str = "") -> list[str]:
 def check_resumable(path: str | Path, model_config: Mapping, accumulate: int) -> None:
     """Refuse to resume a run whose model or accumulation has other settings.
 
-    Settings that trade memory for time (`chunk`, `checkpointing`) may change: the model is the same.
+    Settings that trade memory or the last digits for time (`chunk`, `checkpointing`, `least_transmittance`) may change:
+    the model is the same.
 
     Raises:
         CheckpointError: naming every setting that differs.
@@ -286,7 +287,7 @@ def check_resumable(path: str | Path, model_config: Mapping, accumulate: int) ->
     changed = [
         difference
         for difference in differences(trained, model_config, "model.")
-        if not difference.startswith(("model.render.chunk:", "model.unet.checkpointing:"))
+        if not difference.startswith(("model.render.chunk:", "model.unet.checkpointing:", "model.render.least_trans"))
     ]
     before = checkpoint.get("accumulate_grad_batches", accumulate)
     if before != accumulate:  # Lightning counts batches, of which a step would then have another number

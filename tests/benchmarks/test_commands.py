@@ -41,13 +41,15 @@ def ran(content) -> dict[str, dict]:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="checks what a machine without a GPU says")
-def test_render_times_each_backend_forward_and_backward(tmp_path):
+def test_render_times_each_backend_in_all_ways(tmp_path, capsys):
     content = run(render, tmp_path, "--rays", "32")
     ways = ("torch", "CPU field")
-    assert ran(content).keys() == {f"{way}, {what}" for way in ways for what in ("forward", "forward and backward")}
+    assert ran(content).keys() == {f"{way}, {what}" for way in ways for what in render.WAYS}
+    assert "CPU field, one view: " in capsys.readouterr().out
     assert {row["reason"] for row in content["rows"]} == {None, "needs a CUDA GPU"}
     assert content["settings"] == {"rays": 32, "samples": 8, "plane": 16, "scenes": 1}
-    forward, both = (ran(content)[f"torch, {what}"] for what in ("forward", "forward and backward"))
+    view, forward, both, _ = (ran(content)[f"torch, {what}"] for what in render.WAYS)
+    assert view["setting"]["rays"] == 16**2 and forward["setting"]["rays"] == 32
     assert both["work"]["flops"] == 3 * forward["work"]["flops"] and forward["ratio"] == 1
 
 

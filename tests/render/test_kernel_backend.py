@@ -135,19 +135,16 @@ def test_memory_that_runs_out_is_not_hidden(monkeypatch):
         scene.triton.render(scene.field, scene.rays, scene.jitter)
 
 
-def test_products_are_the_reference_s(monkeypatch):
-    renderer, gpu = Renderer(1, 1, 1.0, 1), torch.device("cuda", 0)
-    monkeypatch.setattr(tuning, "INTERPRETED", False)
-    assert backend._precision(renderer, torch.device("cpu")) == "ieee"
+def test_halves_are_taken_where_the_reference_takes_them():
+    renderer, cpu = Renderer(1, 1, 1.0, 1), torch.device("cpu")
+    assert not backend._half(renderer, cpu)
     with torch.autocast("cpu", torch.bfloat16):
-        assert backend._precision(renderer, torch.device("cpu")) == "bf16"
-    assert backend._precision(renderer, gpu) == "tf32x3"
-    before = torch.backends.cuda.matmul.fp32_precision
-    try:
-        torch.backends.cuda.matmul.fp32_precision = "tf32"
-        assert backend._precision(renderer, gpu) == "tf32"
-    finally:
-        torch.backends.cuda.matmul.fp32_precision = before
-    assert backend._precision(replace(renderer, kernel_precision="ieee"), gpu) == "ieee"
-    monkeypatch.setattr(tuning, "INTERPRETED", True)
-    assert backend._precision(replace(renderer, kernel_precision="bf16"), gpu) == "rounded"
+        assert backend._half(renderer, cpu)
+        assert not backend._half(replace(renderer, kernel_precision="ieee"), cpu)
+    assert backend._half(replace(renderer, kernel_precision="bf16"), cpu)
+
+
+@pytest.mark.parametrize("wrong", [-0.1, 1.0, float("nan")])
+def test_what_must_get_through_is_a_share(wrong):
+    with pytest.raises(ConfigError, match="least_transmittance"):
+        Renderer(1, 1, 1.0, 1, least_transmittance=wrong)

@@ -181,7 +181,14 @@ def test_memory_settings_may_change_on_resuming_but_accumulation_may_not(data, t
     run_training(data, tmp_path, "trainer.max_steps=2")
     with pytest.raises(CheckpointError, match="accumulate_grad_batches: 1 → 2"):
         run_training(data, tmp_path, "trainer.accumulate_grad_batches=2")
-    run_training(data, tmp_path, "trainer.max_steps=4", "model.render.chunk=1024", "model.unet.checkpointing=true")
+    run_training(
+        data,
+        tmp_path,
+        "trainer.max_steps=4",
+        "model.render.chunk=1024",
+        "model.unet.checkpointing=true",
+        "model.render.least_transmittance=0",
+    )
     assert last_checkpoint(tmp_path)["global_step"] == 4
 
 

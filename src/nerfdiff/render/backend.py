@@ -31,11 +31,11 @@ Outputs = tuple[
 ]
 
 _WIDEST = 64
-"""Channels and hidden units for which a program's tiles fit registers and shared memory."""
+"""Hidden units for which a program's tiles fit registers."""
 _MOST_DRAWN = 1024
 """Importance samples that a program holds at once."""
 _POINTS_PER_QUERY = 16
-"""The kernels keep 8 bytes of a sample where the reference's backward pass keeps 0.8 kB of a point."""
+"""The kernels keep 40 bytes of a sample where the reference's backward pass keeps 0.8 kB of a point."""
 
 _COMPARED = ("cuda",)
 """Devices on which kernels are looked at before they are trusted. The interpreter's are tested beforehand."""
@@ -122,8 +122,8 @@ def _note_failure(kind: tuple, what: str, error: Exception, device: torch.device
 def _kind(renderer, field: TriplaneField) -> tuple:
     """What compilation depends on."""
     planes, weight = field.triplane.planes, field.decoder.hidden.weight
-    opaque = renderer.background is None
-    return planes.device, planes.shape[2], weight.shape[-2], weight.ndim, opaque, _precision(renderer, planes.device)
+    chosen = renderer.background is None, renderer.least_transmittance > 0, _half(renderer, planes.device)
+    return planes.device, planes.shape[-2:], weight.shape[-2], weight.ndim, *chosen
 
 
 @cache
@@ -169,7 +169,7 @@ def _tensor_obstacle(
 ) -> str | None:
     triplane = field.triplane
     planes, parameters = triplane.planes, list(field.decoder.parameters())
-    scenes, _, channels, height, width = planes.shape
+    scenes, _, _, height, width = planes.shape
     hidden = field.decoder.hidden.weight.shape[-2]
     fixed = [rays.near, rays.far, triplane.near, triplane.far, triplane.cameras.K]
     fixed += [] if jitter is None else [jitter]
@@ -188,39 +188,23 @@ def _tensor_obstacle(
         return f"{scenes} triplanes do not match the rays' or the decoders' batch"
     if jitter is not None and jitter.shape != (*rays.near.shape, renderer.samples_per_ray):
         return f"jitter of shape {tuple(jitter.shape)}"
-    if max(channels, hidden) > _WIDEST or renderer.importance_samples > _MOST_DRAWN:
+    if hidden > _WIDEST or renderer.importance_samples > _MOST_DRAWN:
         return (
-            f"{channels} channels, {hidden} hidden units, {renderer.importance_samples} importance samples: "
-            f"kernels take {_WIDEST}, {_WIDEST} and {_MOST_DRAWN} at most"
+            f"{hidden} hidden units, {renderer.importance_samples} importance samples: "
+            f"kernels take {_WIDEST} and {_MOST_DRAWN} at most"
         )
-    if 3 * height * width * channels >= 2**31:
-        return f"planes of {height} × {width} × {channels} are too large to index"
+    if 3 * height * width * _WIDEST >= 2**31:
+        return f"planes of {height} × {width} are too large to index"
     if torch.is_grad_enabled() and any(t.requires_grad for t in fixed):
         return "near, far, intrinsics and jitter get no gradients from kernels"
     return _failures.get(_kind(renderer, field))
 
 
-def _precision(renderer, device: torch.device) -> str:
-    """Of products: what the reference's would be computed in."""
-    chosen = renderer.kernel_precision
-    if chosen == "auto":
-        chosen = _regime(device)
-    return "rounded" if chosen == "bf16" and _interpreted() else chosen
-
-
-def _regime(device: torch.device) -> str:
-    """In what the reference's products would be computed.
-
-    Planes are read likewise: under bf16 autocast texels are rounded, where the reference rounds their weighted sum.
-    """
-    if torch.is_autocast_enabled(device.type):
-        # products of tf32 have fp16's mantissa and lack its overflow
-        return "bf16" if torch.get_autocast_dtype(device.type) == torch.bfloat16 else "tf32"
-    if device.type != "cuda":
-        return "ieee"
-    own = torch.backends.cuda.matmul.fp32_precision
-    # Three products of tf32 are within a few bits of fp32's; fp32's own spill the backward pass's registers to memory.
-    return "tf32" if (torch.backends.fp32_precision if own == "none" else own) == "tf32" else "tf32x3"
+def _half(renderer, device: torch.device) -> bool:
+    """Whether kernels compute in halves: where the reference's products would be."""
+    if renderer.kernel_precision == "auto":
+        return torch.is_autocast_enabled(device.type)
+    return renderer.kernel_precision == "bf16"
 
 
 def _distrust(renderer, field: TriplaneField, rays: Rays, jitter, coarse, ordered: bool) -> str | None:
@@ -268,18 +252,19 @@ def _render(renderer, field: TriplaneField, rays: Rays, jitter, coarse, keep_coa
         background=renderer.background,
         points=_POINTS_PER_QUERY * renderer.chunk,
         ordered_points=renderer.chunk,
-        precision=_precision(renderer, triplane.planes.device),
+        half=_half(renderer, triplane.planes.device),
         ordered=ordered,
         image_width=triplane.cameras.width,
         image_height=triplane.cameras.height,
         density_shift=decoder.density_shift,
         density_scale=decoder.density_scale,
+        least_transmittance=renderer.least_transmittance,
     )
     kind = _kind(renderer, field)
 
     def recover(error, tensors, d_outputs, needed):
         _tell(_note_failure(kind, "the backward pass", error, triplane.planes.device))
-        return reference_gradients(renderer, field, settings.precision, tensors, d_outputs, needed)
+        return reference_gradients(renderer, field, settings.half, tensors, d_outputs, needed)
 
     return fused_render(
         settings,

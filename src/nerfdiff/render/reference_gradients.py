@@ -15,7 +15,7 @@ from nerfdiff.field.triplane import Triplane
 def reference_gradients(
     renderer,
     field: TriplaneField,
-    precision: str,
+    half: bool,
     tensors: Sequence[Tensor | None],
     d_outputs: Sequence[Tensor],
     needed: Sequence[bool],
@@ -24,7 +24,7 @@ def reference_gradients(
 
     Args:
         renderer, field: that showed it.
-        precision: of the products that it was made with, as of the kernels' `Settings`.
+        half: whether it was made in half precision.
         tensors: the 14 of `fused_render`.
         d_outputs: gradients of colour, opacity and depth.
     """
@@ -35,7 +35,6 @@ def reference_gradients(
     for i, layer in enumerate((decoder.hidden, decoder.output)):
         layer.weight, layer.bias = (nn.Parameter(value.detach()) for value in parameters[2 * i : 2 * i + 2])
     leaves[1:5] = [decoder.hidden.weight, decoder.hidden.bias, decoder.output.weight, decoder.output.bias]
-    half = precision in ("bf16", "rounded")
     with torch.enable_grad(), torch.autocast(planes.device.type, torch.bfloat16, enabled=half):
         again = TriplaneField(Triplane(planes, field.triplane.cameras, near, far), decoder)
         rays = Rays(origins, directions, ray_near, ray_far)

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import triton
 from jaxtyping import Float
 from torch import Tensor
 
@@ -12,11 +11,10 @@ class Settings:
     """What does not change from ray to ray.
 
     Args:
-        uniform_samples, importance_samples, background: as `Renderer`'s.
-        points: samples in memory at once, as distances: rays are taken in chunks of no more.
+        uniform_samples, importance_samples, background, least_transmittance: as `Renderer`'s.
+        points: samples in memory at once: rays are taken in chunks of no more.
         ordered_points: the same for a backward pass in a fixed order, which keeps features' gradients as well.
-        precision: of the decoder's products: "ieee", "tf32x3", "tf32", "bf16" (which stores planes in bf16 as well),
-            or "rounded", bf16's numbers computed in fp32.
+        half: texels, their interpolation and the activation in fp16; sums over hidden units and along rays are fp32.
         ordered: every sum in a fixed order, the planes' gradients among them.
         image_width, image_height: of the input cameras.
         density_shift, density_scale: the decoder's.
@@ -27,12 +25,13 @@ class Settings:
     background: float | None
     points: int
     ordered_points: int
-    precision: str
+    half: bool
     ordered: bool
     image_width: int
     image_height: int
     density_shift: float
     density_scale: float
+    least_transmittance: float = 0.0
 
     @property
     def samples(self) -> int:
@@ -45,51 +44,36 @@ class Fields:
     """Triplane fields as the kernels read them: contiguous.
 
     Args:
-        planes: channels last, fp32 or bf16.
+        table: texels after the decoder's hidden layer, before its activation (see `texels`): fp16 or fp32.
         K: of the input cameras, in pixels.
         near, far: t_n and t_f.
-        w1, b1, w2, b2: of the decoder's layers; of a decoder for each scene with `scenes` in front.
+        w2, b2: of the decoder's output layer; of a decoder for each scene with `scenes` in front.
     """
 
-    planes: Float[Tensor, "scenes 3 height width channels"]
+    table: Float[Tensor, "scenes 3 height width padded"]
     K: Float[Tensor, "scenes 3 3"]
     near: Float[Tensor, "scenes"]
     far: Float[Tensor, "scenes"]
-    w1: Float[Tensor, "*scenes hidden channels"]
-    b1: Float[Tensor, "*scenes hidden"]
     w2: Float[Tensor, "*scenes 4 hidden"]
     b2: Float[Tensor, "*scenes 4"]
 
-    @property
-    def shared(self) -> bool:
-        """Whether all scenes have one decoder."""
-        return self.w1.ndim == 2
-
     def arguments(self, settings: Settings) -> dict:
         """Of every kernel that evaluates a field."""
-        hidden, channels = self.w1.shape[-2:]
         return {
-            "planes": self.planes,
+            "table": self.table,
             "K": self.K,
             "scene_near": self.near,
             "scene_far": self.far,
-            "w1": self.w1,
-            "b1": self.b1,
             "w2": self.w2,
             "b2": self.b2,
             "image_width": float(settings.image_width),
             "image_height": float(settings.image_height),
-            "shift": float(settings.density_shift),
-            "scale": float(settings.density_scale),
-            "height": self.planes.shape[2],
-            "width": self.planes.shape[3],
-            "SHARED": self.shared,
-            "PRECISION": settings.precision,
-            "C": channels,
-            "HIDDEN": hidden,
-            # a product's inner side is at least 16 long
-            "CP": max(16, triton.next_power_of_2(channels)),
-            "HP": max(16, triton.next_power_of_2(hidden)),
+            "SHARED": self.w2.ndim == 2,
+            "HALF": settings.half,
+            "HIDDEN": self.w2.shape[-1],
+            "HP": self.table.shape[-1],
+            "H": self.table.shape[2],
+            "W": self.table.shape[3],
         }
 
 
@@ -108,18 +92,25 @@ class Bundle:
     jitter: Float[Tensor, "scenes n samples"] | None
     coarse: Float[Tensor, "scenes n bins"] | None = None
 
-    def arguments(self) -> dict:
-        """Of every kernel that walks along rays."""
-        return {
-            "origins": self.origins,
-            "directions": self.directions,
-            "near": self.near,
-            "far": self.far,
-            "n": self.near.shape[1],
-        }
-
     def chunks(self, points: int, samples: int) -> list[tuple[int, int]]:
         """(first, count) of rays so that no more than so many points are in memory, of one ray at least."""
         scenes, n = self.near.shape
         size = max(1, points // (scenes * samples))
         return [(first, min(size, n - first)) for first in range(0, n, size)]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What was seen along some rays.
+
+    Args:
+        distances: of the uniform samples, then of those drawn: both ascending.
+        values: red, green, blue, and density per scene unit at them.
+        stops: of each ray, the distance behind which it was not followed; None where it was to its end.
+        sums: of the uniform samples' weights, from the first on.
+    """
+
+    distances: Float[Tensor, "scenes count samples"]
+    values: Float[Tensor, "scenes count samples 4"]
+    stops: Float[Tensor, "scenes count"] | None
+    sums: Float[Tensor, "scenes count uniform"]

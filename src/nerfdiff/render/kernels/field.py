@@ -1,195 +1,235 @@
-"""Device code of a triplane field: ξ_W(x) and f_θ at a column of points."""
+"""Device code of a triplane field, whose texels the decoder's first layer was applied to: f_θ(ξ_W(x)) at points.
+
+Points are few and their hidden units side by side in neighbouring lanes: every sum over units stays in one warp, and
+nothing waits for other warps. HALF: gathers and the activation are computed in fp16, two numbers at a time.
+"""
 
 from typing import no_type_check
 
 import triton
 import triton.language as tl
 
-
-@triton.jit
-@no_type_check
-def frustum(scene, K, near, far, width, height):
-    """t_n, 1 / (t_f − t_n), and the intrinsics in units of the image's size."""
-    start, end = tl.load(near + scene), tl.load(far + scene)
-    fx, cx = tl.load(K + scene * 9) / width, tl.load(K + scene * 9 + 2) / width
-    fy, cy = tl.load(K + scene * 9 + 4) / height, tl.load(K + scene * 9 + 5) / height
-    return start, 1.0 / (end - start), fx, cx, fy, cy
+PORTABLE = tl.constexpr(triton.knobs.runtime.interpret)
+"""Triton's interpreter knows no inline assembly."""
 
 
 @triton.jit
 @no_type_check
-def unit_coordinates(x, y, z, start, inverse_extent, fx, cx, fy, cy):
-    """x̃ scaled to [0, 1]³ inside the frustum, and whether the point lies beyond the near plane.
+def add_product(a, b, c):
+    """a · b + c of halves."""
+    if PORTABLE:
+        return (a * b + c).to(tl.float16)
+    else:
+        return tl.inline_asm_elementwise(
+            "fma.rn.f16x2 $0, $1, $2, $3;", "=r,r,r,r", [a, b, c], dtype=tl.float16, is_pure=True, pack=2
+        )
 
-    As `Triplane.frustum_coordinates`: what lies before t_n is put in the middle, and counts for nothing.
+
+@triton.jit
+@no_type_check
+def tanh_halves(x):
+    """tanh of halves, to 2⁻¹¹."""
+    if PORTABLE:
+        return (2.0 * tl.sigmoid(2.0 * x.to(tl.float32)) - 1.0).to(tl.float16)
+    else:
+        return tl.inline_asm_elementwise(
+            "tanh.approx.f16x2 $0, $1;", "=r,r", [x], dtype=tl.float16, is_pure=True, pack=2
+        )
+
+
+@triton.jit
+@no_type_check
+def sigmoid(x, HALF: tl.constexpr):
+    """1 / (1 + e⁻ˣ); HALF: to 2⁻¹²."""
+    if HALF and not PORTABLE:
+        half = tl.inline_asm_elementwise(
+            "tanh.approx.f32 $0, $1;", "=f,f", [0.5 * x], dtype=tl.float32, is_pure=True, pack=1
+        )
+        return 0.5 * half + 0.5
+    else:
+        return tl.sigmoid(x)
+
+
+@triton.jit
+@no_type_check
+def reciprocal(x):
+    """1 / x, to the last bit or two."""
+    if PORTABLE:
+        return 1.0 / tl.where(x == 0.0, 1e-30, x)
+    else:
+        return tl.inline_asm_elementwise(
+            "rcp.approx.ftz.f32 $0, $1;", "=f,f", [x], dtype=tl.float32, is_pure=True, pack=1
+        )
+
+
+@triton.jit
+@no_type_check
+def exponential(x):
+    """eˣ, to the last bits; what is less than 10⁻³⁸ is 0."""
+    if PORTABLE:
+        return tl.exp(x)
+    else:
+        return tl.inline_asm_elementwise(
+            "ex2.approx.ftz.f32 $0, $1;", "=f,f", [x * 1.4426950408889634], dtype=tl.float32, is_pure=True, pack=1
+        )
+
+
+@triton.jit
+@no_type_check
+def softplus(x, HALF: tl.constexpr):
+    """log(1 + eˣ); accurate where it is tiny as well (Kahan's log1p), HALF: to 10⁻⁷ there."""
+    e = exponential(-tl.abs(x))
+    one_more = 1.0 + e
+    if HALF:
+        if PORTABLE:
+            return tl.maximum(x, 0.0) + tl.log(one_more)
+        else:
+            doublings = tl.inline_asm_elementwise(
+                "lg2.approx.ftz.f32 $0, $1;", "=f,f", [one_more], dtype=tl.float32, is_pure=True, pack=1
+            )
+            return tl.maximum(x, 0.0) + 0.6931471805599453 * doublings
+    else:
+        tiny = one_more == 1.0
+        return tl.maximum(x, 0.0) + tl.where(tiny, e, tl.log(one_more) * (e / tl.where(tiny, 1.0, one_more - 1.0)))
+
+
+@triton.jit
+@no_type_check
+def texel(unit, valid, SIZE: tl.constexpr):
+    """The first of the two texels around a coordinate in [0, 1], how far on the second is, and where there is a slope.
+
+    Borders repeat. Comparisons are written so that a NaN ends at the first texel, never outside the plane. What is not
+    valid is put in the middle.
     """
-    valid = z >= start
-    inverse = 1.0 / tl.where(valid, z, 1.0)
-    u = tl.where(valid, fx * x * inverse + cx, 0.5)
-    v = tl.where(valid, fy * y * inverse + cy, 0.5)
-    w = tl.where(valid, (z - start) * inverse_extent, 0.5)
-    return u, v, w, valid
+    position = tl.where(valid, unit * SIZE - 0.5, 0.5 * SIZE - 0.5)
+    sloped = (position > 0.0) & (position < SIZE - 1.0)
+    position = tl.where(position > 0.0, tl.minimum(position, SIZE - 1.0), 0.0)
+    first = tl.minimum(position, max(SIZE - 2, 0) * 1.0).to(tl.int32)
+    return first, position - first.to(tl.float32), sloped
 
 
 @triton.jit
 @no_type_check
-def texel(unit, size):
-    """The two texels around a coordinate, how far the second is on the way, and where there is a slope.
+def project(frame, x, y, z):
+    """x̃ scaled to [0, 1]³ inside the frustum, 1 / z, and whether the point lies beyond the near plane.
 
-    Borders repeat. Comparisons are written so that a NaN ends at the first texel, never outside the plane.
+    As `Triplane.frustum_coordinates`: what lies before t_n counts for nothing.
     """
-    position = unit * size - 0.5
-    last = (size - 1) * 1.0
-    sloped = (position > 0.0) & (position < last)
-    position = tl.where(position > 0.0, tl.where(position < last, position, last), 0.0)
-    first = position.to(tl.int32)
-    return first, tl.minimum(first + 1, size - 1), position - first.to(tl.float32), sloped
+    start, inverse_extent, fx, cx, fy, cy = frame
+    inverse = reciprocal(z)
+    return fx * x * inverse + cx, fy * y * inverse + cy, (z - start) * inverse_extent, inverse, z >= start
 
 
 @triton.jit
 @no_type_check
-def corner(plane, row, column, width, channel, C: tl.constexpr):
-    """Features of one texel per point, fp32."""
-    at = (row * width + column) * C
-    return tl.load(plane + at[:, None] + channel[None, :], mask=channel[None, :] < C, other=0.0).to(tl.float32)
+def places(u, v, w, valid, H: tl.constexpr, W: tl.constexpr):
+    """Of W_xy, W_xz and W_yz, whose columns run along x, x and z: texels (row, column) of each."""
+    across, down, deep = texel(u, valid, W), texel(v, valid, H), texel(w, valid, H)
+    return (down, across), (deep, across), (down, deep if H == W else texel(w, valid, W))
 
 
 @triton.jit
 @no_type_check
-def axes(plane, u, v, w):
-    """The coordinates along (rows, columns) of W_xy, W_xz or W_yz, whose columns run along x, x and z."""
-    return tl.where(plane == 1, w, v), tl.where(plane == 2, w, u)
+def corners(row, column):
+    """Weights of a cell's corners."""
+    _, down, _ = row
+    _, right, _ = column
+    both = down * right
+    return 1.0 - down - (right - both), right - both, down - both, both
 
 
 @triton.jit
 @no_type_check
-def features(planes, u, v, w, height, width, channel, C: tl.constexpr):
-    """W_xy + W_xz + W_yz at points: bilinear, [points, channels].
+def cell(PLANE: tl.constexpr, place, H: tl.constexpr, W: tl.constexpr):
+    """The index of a cell's first texel."""
+    row, column = place
+    return PLANE * H * W + row[0] * W + column[0]
 
-    A loop, and no three copies: all twelve gathers at once would need more registers than there are.
-    """
-    found = tl.zeros([u.shape[0], channel.shape[0]], tl.float32)
-    for plane in range(3):
-        along_rows, along_columns = axes(plane, u, v, w)
-        r0, r1, fr, _ = texel(along_rows, height)
-        c0, c1, fc, _ = texel(along_columns, width)
-        at = planes + plane * height * width * C
-        found += corner(at, r0, c0, width, channel, C) * ((1.0 - fr) * (1.0 - fc))[:, None]
-        found += corner(at, r0, c1, width, channel, C) * ((1.0 - fr) * fc)[:, None]
-        found += corner(at, r1, c0, width, channel, C) * (fr * (1.0 - fc))[:, None]
-        found += corner(at, r1, c1, width, channel, C) * (fr * fc)[:, None]
+
+@triton.jit
+@no_type_check
+def gathered(table, places, HP: tl.constexpr, H: tl.constexpr, W: tl.constexpr, HALF: tl.constexpr):
+    """The hidden layer before its activation at points: [points, HP], fp16 or fp32."""
+    right: tl.constexpr = HP if W > 1 else 0
+    below: tl.constexpr = W * HP if H > 1 else 0
+    found = tl.zeros([places[0][0][0].shape[0], HP], tl.float16 if HALF else tl.float32)
+    for plane in tl.static_range(3):
+        w00, w01, w10, w11 = corners(*places[plane])
+        at = table + (cell(plane, places[plane], H, W) * HP)[:, None] + tl.arange(0, HP)[None, :]
+        found = weighted(at, w00, found, HALF)
+        found = weighted(at + right, w01, found, HALF)
+        found = weighted(at + below, w10, found, HALF)
+        found = weighted(at + (below + right), w11, found, HALF)
     return found
 
 
 @triton.jit
 @no_type_check
-def operand(x, PRECISION: tl.constexpr):
-    """What a product sees of x. `rounded` gives bf16's numbers where there is no bf16 arithmetic (interpreter)."""
-    if PRECISION == "bf16":
-        return x.to(tl.bfloat16)
-    elif PRECISION == "rounded":
-        return x.to(tl.bfloat16).to(tl.float32)
+def weighted(at, weight, found, HALF: tl.constexpr):
+    """`found` and a texel's share."""
+    value = tl.load(at)
+    if HALF:
+        return add_product(value, tl.broadcast_to(weight.to(tl.float16)[:, None], value.shape), found)
     else:
-        return x
+        return found + value * weight[:, None]
 
 
 @triton.jit
 @no_type_check
-def dot(a, b, PRECISION: tl.constexpr):
-    """A product of operands, with fp32 sums."""
-    if PRECISION == "bf16":
-        return tl.dot(a, b)
-    elif PRECISION == "rounded":
-        return tl.dot(a, b, input_precision="ieee")
+def activated(pre, HALF: tl.constexpr):
+    """SiLU of the hidden layer, and the sigmoid in it: fp32."""
+    if HALF:
+        # x σ(x) = x / 2 + x / 2 tanh(x / 2)
+        half = pre * 0.5
+        tanh = tanh_halves(half)
+        return add_product(half, tanh, half).to(tl.float32), 0.5 * tanh.to(tl.float32) + 0.5
     else:
-        return tl.dot(a, b, input_precision=PRECISION)
-
-
-@triton.jit
-@no_type_check
-def first_layer(weight, bias, C: tl.constexpr, HIDDEN: tl.constexpr, CP: tl.constexpr, HP: tl.constexpr):
-    """The hidden layer's weight as [channels, hidden] and its bias, padded with zeros."""
-    channel, unit = tl.arange(0, CP), tl.arange(0, HP)
-    inside = (channel[:, None] < C) & (unit[None, :] < HIDDEN)
-    w1 = tl.load(weight + unit[None, :] * C + channel[:, None], mask=inside, other=0.0)
-    return w1.to(tl.float32), tl.load(bias + unit, mask=unit < HIDDEN, other=0.0).to(tl.float32)
-
-
-@triton.jit
-@no_type_check
-def second_layer(weight, bias, HIDDEN: tl.constexpr, HP: tl.constexpr):
-    """The output layer's weight as [hidden, 16] and its bias: red, green, blue, density, and zeros.
-
-    A product's sides are at least 16 long.
-    """
-    unit, k = tl.arange(0, HP), tl.arange(0, 16)
-    inside = (unit[:, None] < HIDDEN) & (k[None, :] < 4)
-    w2 = tl.load(weight + k[None, :] * HIDDEN + unit[:, None], mask=inside, other=0.0)
-    return w2.to(tl.float32), tl.load(bias + k, mask=k < 4, other=0.0).to(tl.float32)
-
-
-@triton.jit
-@no_type_check
-def column(outputs, k: tl.constexpr):
-    """One of the 16 columns of what the output layer says of points."""
-    return tl.sum(tl.where(tl.arange(0, 16)[None, :] == k, outputs, 0.0), 1)
-
-
-@triton.jit
-@no_type_check
-def columns(red, green, blue, density):
-    """The inverse of `column`: four quantities of points side by side, [points, 16]."""
-    k = tl.arange(0, 16)[None, :]
-    second = tl.where(k == 2, blue[:, None], tl.where(k == 3, density[:, None], 0.0))
-    return tl.where(k == 0, red[:, None], tl.where(k == 1, green[:, None], second))
-
-
-@triton.jit
-@no_type_check
-def softplus(x):
-    """log(1 + eˣ), accurate where it is tiny as well (Kahan's log1p)."""
-    e = tl.exp(-tl.abs(x))
-    one_more = 1.0 + e
-    tiny = one_more == 1.0
-    return tl.maximum(x, 0.0) + tl.where(tiny, e, tl.log(one_more) * (e / tl.where(tiny, 1.0, one_more - 1.0)))
+        gate = tl.sigmoid(pre)
+        return pre * gate, gate
 
 
 @triton.jit
 @no_type_check
 def scene_field(
-    scene, planes, K, near, far, w1, b1, w2, b2, image_width, image_height, height, width,
-    SHARED: tl.constexpr, PRECISION: tl.constexpr, C: tl.constexpr, HIDDEN: tl.constexpr, CP: tl.constexpr,
-    HP: tl.constexpr,
+    scene, table, K, near, far, w2, b2, image_width, image_height,
+    SHARED: tl.constexpr, HIDDEN: tl.constexpr, HP: tl.constexpr, H: tl.constexpr, W: tl.constexpr,
 ):  # fmt: skip
-    """What a program reads of a scene's field before its first point: planes, `frustum`, and layers as operands."""
+    """What a program reads of a scene's field before its first point: texels, frustum and output layer.
+
+    The frustum: t_n, 1 / (t_f − t_n), and the intrinsics in units of the image's size.
+    """
+    start, end = tl.load(near + scene), tl.load(far + scene)
+    fx, cx = tl.load(K + scene * 9) / image_width, tl.load(K + scene * 9 + 2) / image_width
+    fy, cy = tl.load(K + scene * 9 + 4) / image_height, tl.load(K + scene * 9 + 5) / image_height
     own = 0 if SHARED else scene
-    hidden_w, hidden_b = first_layer(w1 + own * HIDDEN * C, b1 + own * HIDDEN, C, HIDDEN, CP, HP)
-    output_w, output_b = second_layer(w2 + own * 4 * HIDDEN, b2 + own * 4, HIDDEN, HP)
-    layers = operand(hidden_w, PRECISION), hidden_b, operand(output_w, PRECISION), output_b
-    frame = frustum(scene, K, near, far, image_width, image_height)
-    return planes + scene * 3 * height * width * C, frame, layers
+    unit = tl.arange(0, HP)
+    w2, b2 = w2 + own * 4 * HIDDEN + unit, b2 + own * 4
+    weights = (
+        tl.load(w2, mask=unit < HIDDEN, other=0.0).to(tl.float32),
+        tl.load(w2 + HIDDEN, mask=unit < HIDDEN, other=0.0).to(tl.float32),
+        tl.load(w2 + 2 * HIDDEN, mask=unit < HIDDEN, other=0.0).to(tl.float32),
+        tl.load(w2 + 3 * HIDDEN, mask=unit < HIDDEN, other=0.0).to(tl.float32),
+    )
+    biases = (
+        tl.load(b2).to(tl.float32),
+        tl.load(b2 + 1).to(tl.float32),
+        tl.load(b2 + 2).to(tl.float32),
+        tl.load(b2 + 3).to(tl.float32),
+    )
+    return table + scene * 3 * H * W * HP, (start, 1.0 / (end - start), fx, cx, fy, cy), weights, biases
 
 
 @triton.jit
 @no_type_check
 def query(
-    planes, x, y, z, frame, layers, shift, scale, height, width, C: tl.constexpr, CP: tl.constexpr,
-    PRECISION: tl.constexpr,
+    table, frame, weights, biases, x, y, z, shift, scale,
+    HP: tl.constexpr, H: tl.constexpr, W: tl.constexpr, HALF: tl.constexpr,
 ):  # fmt: skip
-    """f_θ(ξ_W(x)) at points: the output layer's 16 columns and density per scene unit, and how they came about.
-
-    Returns:
-        outputs [points, 16]; density [points]; (u, v, w, valid) of `unit_coordinates`; and
-        (features, hidden layer before its activation, the activation's gate, hidden layer). What a kernel has no use
-        for is not computed: the compiler drops it.
-    """
-    start, inverse_extent, fx, cx, fy, cy = frame
-    hidden_w, hidden_b, output_w, output_b = layers
-    u, v, w, valid = unit_coordinates(x, y, z, start, inverse_extent, fx, cx, fy, cy)
-    found = operand(features(planes, u, v, w, height, width, tl.arange(0, CP), C), PRECISION)
-    pre = dot(found, hidden_w, PRECISION) + hidden_b[None, :]
-    gate = tl.sigmoid(pre)
-    hidden = operand(pre * gate, PRECISION)
-    outputs = dot(hidden, output_w, PRECISION) + output_b[None, :]
-    density = tl.where(valid, softplus(column(outputs, 3) + shift) * scale * inverse_extent, 0.0)
-    return outputs, density, (u, v, w, valid), (found, pre, gate, hidden)
+    """Colour and density per scene unit of points."""
+    u, v, w, _, valid = project(frame, x, y, z)
+    hidden, _ = activated(gathered(table, places(u, v, w, valid, H, W), HP, H, W, HALF), HALF)
+    red = sigmoid(tl.sum(hidden * weights[0][None, :], 1) + biases[0], HALF)
+    green = sigmoid(tl.sum(hidden * weights[1][None, :], 1) + biases[1], HALF)
+    blue = sigmoid(tl.sum(hidden * weights[2][None, :], 1) + biases[2], HALF)
+    density = softplus(tl.sum(hidden * weights[3][None, :], 1) + biases[3] + shift, HALF) * (scale * frame[1])
+    return red, green, blue, tl.where(valid, density, 0.0)

@@ -7,8 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nerfdiff.render.kernels.arguments import Bundle, Fields, Settings
-from nerfdiff.render.kernels.passes import Gradients, gradients, render
+from nerfdiff.render.kernels.arguments import Bundle, Fields, Seen, Settings
+from nerfdiff.render.kernels.passes import gradients, render
+from nerfdiff.render.kernels.texels import hidden_texels, texel_gradients
 
 Outputs = tuple[
     Float[Tensor, "scenes n 3"],
@@ -21,15 +22,17 @@ Outputs = tuple[
 class FusedRender(torch.autograd.Function):
     """Colour, opacity and depth of rays through triplane fields.
 
-    Saved for the backward pass: the arguments, and the picture. Where to look along each ray is found again.
+    Saved for the backward pass: the arguments, texels after the hidden layer, the picture, and what was seen along
+    the rays if that is no more than memory is to hold; else it is looked for again.
     """
 
     @staticmethod
     def forward(ctx, settings, recover, keep_coarse, *tensors):
         with torch.cuda.device_of(tensors[0]):  # kernels start on the current device
-            *outputs, kept = render(settings, *_packed(settings, tensors), keep_coarse)
+            table = hidden_texels(*tensors[:3], settings.half)
+            *outputs, kept, seen = render(settings, *_packed(table, tensors), keep_coarse)
         ctx.settings, ctx.recover = settings, recover
-        ctx.save_for_backward(*tensors, *outputs)
+        ctx.save_for_backward(*tensors, *outputs, table, *(() if seen is None else vars(seen).values()))
         if kept is not None:
             ctx.mark_non_differentiable(kept)
         return *outputs, kept
@@ -37,11 +40,14 @@ class FusedRender(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *d_outputs):
-        tensors, outputs, d_outputs = ctx.saved_tensors[:-3], ctx.saved_tensors[-3:], d_outputs[:3]
+        saved, d_outputs = ctx.saved_tensors, d_outputs[:3]
+        tensors, outputs, table, seen = saved[:14], saved[14:17], saved[17], saved[18:]
         needed = ctx.needs_input_grad[3:10]
         try:
             with torch.cuda.device_of(tensors[0]):
-                found = _gradients(ctx.settings, tensors, outputs, d_outputs, needed)
+                found = _gradients(
+                    ctx.settings, tensors, table, Seen(*seen) if seen else None, outputs, d_outputs, needed
+                )
         except torch.OutOfMemoryError:
             raise
         except Exception as error:
@@ -81,48 +87,41 @@ def fused_render(
     return FusedRender.apply(settings, recover, keep_coarse, *tensors)
 
 
-def _packed(settings: Settings, tensors: tuple[Tensor | None, ...]) -> tuple[Fields, Bundle]:
-    """As the kernels read them: planes channels last, and everything contiguous."""
-    planes, w1, b1, w2, b2, origins, directions, K, scene_near, scene_far, near, far, jitter, coarse = tensors
-    stored = torch.bfloat16 if settings.precision == "bf16" else torch.float32
-    planes = planes.movedim(2, -1).to(stored, memory_format=torch.contiguous_format).contiguous()
+def _packed(table: Tensor, tensors: tuple[Tensor | None, ...]) -> tuple[Fields, Bundle]:
+    """As the kernels read them: contiguous."""
+    _, _, _, w2, b2, origins, directions, K, scene_near, scene_far, near, far, jitter, coarse = tensors
     frustum = (value.float().contiguous() for value in (K, scene_near, scene_far))
-    decoder = (value.contiguous() for value in (w1, b1, w2, b2))
     rays = (value.contiguous() for value in (origins, directions, near, far))
     more = (None if value is None else value.contiguous() for value in (jitter, coarse))
-    return Fields(planes, *frustum, *decoder), Bundle(*rays, *more)
+    return Fields(table, *frustum, w2.contiguous(), b2.contiguous()), Bundle(*rays, *more)
 
 
 def _gradients(
     settings: Settings,
     tensors: tuple[Tensor | None, ...],
+    table: Tensor,
+    seen: Seen | None,
     outputs: tuple[Tensor, ...],
     d_outputs: tuple[Tensor, ...],
     needed: tuple[bool, ...],
 ) -> list[Tensor | None]:
     """Of the first 7 tensors, where needed."""
-    fields, bundle = _packed(settings, tensors)
+    planes, w1, _, w2 = tensors[:4]
     found = gradients(
         settings,
-        fields,
-        bundle,
+        *_packed(table, tensors),
+        seen,
         outputs,
         tuple(value.contiguous() for value in d_outputs),
-        planes=needed[0],
-        decoder=any(needed[1:5]),
+        table=any(needed[:3]),
+        w2=needed[3],
         rays=any(needed[5:7]),
     )
-    planes = None if found.planes is None else found.planes.movedim(-1, 2)
-    values = [planes, *_decoder_gradients(found, fields), found.origins, found.directions]
+    first = (None, None, None)
+    if found.table is not None:
+        first = texel_gradients(found.table, planes, w1, needed[0], any(needed[1:3]))
+    last = (d if d is None or w2.ndim == 3 else d.sum(0) for d in (found.w2, found.b2))
+    values = (*first, *last, found.origins, found.directions)
     return [
         value.to(like.dtype) if need else None for value, like, need in zip(values, tensors[:7], needed, strict=True)
     ]
-
-
-def _decoder_gradients(found: Gradients, fields: Fields) -> list[Tensor | None]:
-    parameters = (fields.w1, fields.b1, fields.w2, fields.b2)
-    if found.decoder is None:
-        return [None] * 4
-    numbers = found.decoder.sum(0) if fields.shared else found.decoder
-    sizes = [value.numel() // (1 if fields.shared else len(value)) for value in parameters]
-    return [part.reshape(value.shape) for part, value in zip(numbers.split(sizes, -1), parameters, strict=True)]

@@ -1,4 +1,4 @@
-"""Device code along rays: distances, bins and weights of tiles [rays, samples]."""
+"""Device code along rays: distances, weights, and numbers that lie side by side."""
 
 from typing import no_type_check
 
@@ -14,23 +14,6 @@ def uniform_distance(start, extent, i, bins, jitter, mask, JITTER: tl.constexpr)
     lower, upper = start + extent * (i * step), start + extent * ((i + 1) * step)
     offset = tl.load(jitter + i, mask=mask, other=0.5) if JITTER else 0.5
     return tl.minimum(lower + offset * (upper - lower), tl.maximum(upper, lower))
-
-
-@triton.jit
-@no_type_check
-def interval(before, here, after, start, end, i, last):
-    """Length of the interval around sample i, between the middles to its neighbours."""
-    lower = tl.where(i == 0, start, 0.5 * (before + here))
-    upper = tl.where(i == last, end, 0.5 * (here + after))
-    return upper - lower
-
-
-@triton.jit
-@no_type_check
-def optical_depth(density, length):
-    """σδ, cut where nothing gets through any more (e⁻⁴⁰): sums of greater ones would swallow the small ones."""
-    optical = density * length
-    return tl.where(optical > 40.0, 40.0, optical)
 
 
 @triton.jit
@@ -63,16 +46,19 @@ def store_vector(values, at, x, y, z, mask):
 
 @triton.jit
 @no_type_check
-def around(distances, i, near, far, row, samples):
-    """Of samples i of rays: whether they exist, where they are, and the length of the interval around each.
+def four(values, at, mask):
+    """Four numbers of each entry [*, 4], read at once."""
+    found = tl.load(values + at[:, None] * 4 + tl.arange(0, 4)[None, :], mask=mask[:, None], other=0.0)
+    even, odd = tl.split(tl.reshape(found, [at.shape[0], 2, 2]))
+    first, third = tl.split(even)
+    second, fourth = tl.split(odd)
+    return first, second, third, fourth
 
-    Args:
-        distances: pointers [rays, 1] to each ray's ascending distances.
-        near, far, row: of each ray [rays]; `row` tells whether there is one.
-    """
-    inside = row[:, None] & (i < samples)
-    before = tl.load(distances + i - 1, mask=inside & (i > 0), other=0.0)
-    centre = tl.load(distances + i, mask=inside, other=0.0)
-    after = tl.load(distances + i + 1, mask=row[:, None] & (i + 1 < samples), other=0.0)
-    length = interval(before, centre, after, near[:, None], far[:, None], i, samples - 1)
-    return inside, centre, tl.where(inside, length, 0.0)
+
+@triton.jit
+@no_type_check
+def store_four(values, at, first, second, third, fourth, mask):
+    """The inverse of `four`."""
+    together = tl.join(tl.join(first, third), tl.join(second, fourth))
+    together = tl.reshape(together, [at.shape[0], 4])
+    tl.store(values + at[:, None] * 4 + tl.arange(0, 4)[None, :], together, mask=mask[:, None])

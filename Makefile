@@ -68,7 +68,7 @@ dashboard: setup
 	$(BIN)/tensorboard --logdir $(LOGDIR) --port 6006 --samples_per_plugin images=100
 
 docs: setup
-	$(BIN)/python -m mkdocs build --strict --site-dir build/docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict --site-dir build/docs
 	@echo 'open build/docs/index.html'
 
 clean:

@@ -27,8 +27,9 @@ $(VENV)/.installed: pyproject.toml $(LOCK)
 	cp $(LOCK) $(VENV)/lock.txt
 	@test $(TORCH) = cuda || { \
 		$(BIN)/python -m pip install --quiet --no-deps --retries 1 $(if $(filter cpu,$(TORCH)),--extra-index-url $(CPU_INDEX)) $(CPU_BUILD) 2>$(VENV)/cpu.log && \
-		awk '/^[^ ]/ { gpu = /^($(GPU_ONLY))==/ } !gpu' $(LOCK) >$(VENV)/lock.txt && echo "PyTorch's CPU build: $(CPU_BUILD)"; } || \
-		echo "the indexes at hand have no CPU build of PyTorch of this version; taking PyPI's, which runs on a CPU, too"
+		awk '/^[^ ]/ { gpu = /^($(GPU_ONLY))==/ } !gpu' $(LOCK) >$(VENV)/lock.txt && echo "PyTorch's CPU build: $(CPU_BUILD)"; } || { \
+		echo "no CPU build of this PyTorch on the indexes that were asked ($(VENV)/cpu.log)"; test $(TORCH) = auto && \
+		echo "taking the usual one, which runs on a CPU, too (make setup TORCH=cpu would ask PyTorch's own index)"; }
 	@test $(LOCKED) = 0 || $(BIN)/python -m pip install --quiet --require-hashes --requirement $(VENV)/lock.txt 2>$(VENV)/lock.log || { \
 		cat $(VENV)/lock.log; ! grep -q 'DO NOT MATCH THE HASHES' $(VENV)/lock.log && \
 		echo 'WARNING: the versions of $(LOCK) cannot be installed here; taking the newest that pyproject.toml allows'; }

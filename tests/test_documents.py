@@ -16,6 +16,7 @@ DOCUMENTS = sorted([*PROJECT.glob("*.md"), *PROJECT.glob("docs/*.md"), *PROJECT.
 FOLDERS = ("assets", "benchmarks", "conf", "docs", "notebooks", "src", "tests")
 MADE = ("docs/speed_accuracy/chart",)
 """Paths that commands make."""
+OWN_CONFIG = "--config-dir"
 CODE = re.compile(r"^```.*?^```|^(?: {4}).*?$|`[^`\n]+`", re.S | re.M)
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 
@@ -46,7 +47,8 @@ def wrong_links(path: Path, text: str) -> list[str]:
 def wrong_paths(text: str) -> list[str]:
     """Paths within the project, in code, that are not there."""
     words = re.findall(rf"(?<![\w./-])((?:{'|'.join(FOLDERS)})/[\w./-]*[\w/])", "\n".join(CODE.findall(text)))
-    return [word for word in words if not (PROJECT / word).exists() and not word.startswith(MADE)]
+    own = ("conf/",) if OWN_CONFIG in text else ()  # a reader's, beside the project's
+    return [word for word in words if not (PROJECT / word).exists() and not word.startswith((*MADE, *own))]
 
 
 def commands(text: str) -> Iterator[tuple[str, list[str]]]:
@@ -63,14 +65,14 @@ def wrong_commands(text: str) -> list[str]:
     for path, words in commands(text):
         if not (PROJECT / path).is_file():
             wrong.append(path)
-        elif path.startswith("src/"):
+        elif path.startswith("src/") and OWN_CONFIG not in words:
             try:
                 check_overrides(Path(path).stem, quote_values(words))
                 if not {"-m", "--multirun"} & set(words) and not any("," in word for word in words):
                     load_config(Path(path).stem, [word for word in words if "=" in word])
             except ConfigError as error:
                 wrong.append(f"{path} {shlex.join(words)}: {error}")
-        else:
+        elif path.startswith("benchmarks/"):
             options = [word for word in words if word.startswith("--")]
             wrong += [f"{path} {option}" for option in options if f'"{option}"' not in sources]
     return wrong
@@ -102,6 +104,7 @@ make test
 python src/train.py model=tiny \\
     data=nowhere    # a comment
 python src/distill.py ckpt=demo data.root=… 'picture={fov:3}'
+python src/train.py --help
 ```
 """
     path = tmp_path / "page.md"
@@ -112,6 +115,8 @@ python src/distill.py ckpt=demo data.root=… 'picture={fov:3}'
         "src/train.py modle=tiny", "src/gone.py", "benchmarks/all.py --hours", "src/train.py model=tiny data=nowhere",
     ]  # fmt: skip
     assert wrong_targets(text) == ["tea"]
+    own = "`python src/train.py --config-dir mine data=boxes` reads `conf/data/boxes.yaml`, not `src/gone.py`"
+    assert wrong_paths(own) == ["src/gone.py"] and wrong_commands(own) == []
 
 
 def test_the_readme_is_read_in_three_minutes_and_names_choices_that_exist():

@@ -1,6 +1,7 @@
 """The rooms of `src/` and which may import which, read from the import statements (those within functions too)."""
 
 import ast
+import sys
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
@@ -20,6 +21,8 @@ LAYERS = (
 GENERATOR = "procedural"
 MAY_GENERATE = {"commands", "demo"}
 FOR_GENERATOR = {"utils", "poses", "data"}
+LIGHT = {"hydra", "omegaconf", "psutil", "filelock", "yaml"}
+"""What a command may load before it knows that it has something to do."""
 
 
 def modules(src: Path) -> dict[str, ast.Module]:
@@ -95,9 +98,9 @@ def test_the_generator_is_nothing_that_the_method_needs(known):
     assert {target for start, target, _ in arrows if start == GENERATOR} == FOR_GENERATOR
 
 
-def test_processes_that_render_scenes_load_no_pytorch(known):
-    """Statements at the top of modules alone: what is imported within a function is another matter."""
-    waiting, seen = [name for name in known if name.split(".")[0] == GENERATOR], set()
+def loaded(known: dict[str, ast.Module], waiting: list[str]) -> tuple[set[str], set[str]]:
+    """(modules of `src/`, other packages) that load with these modules; not what is imported within a function."""
+    seen, others = set(), set()
     while waiting:
         name = waiting.pop()
         if name in seen:
@@ -105,9 +108,20 @@ def test_processes_that_render_scenes_load_no_pytorch(known):
         seen.add(name)
         tops = [node for node in known[name].body if isinstance(node, ast.Import | ast.ImportFrom)]
         found = set(imported(ast.Module(tops, []), known))
-        assert not {"torch", "lightning", "torchvision"} & {target.split(".")[0] for target in found}, name
-        waiting += [target for target in found if target in known]
-    assert "nerfdiff.poses" in seen
+        others |= {target.split(".")[0] for target in found - known.keys()}
+        waiting = [*waiting, *(target for target in found if target in known)]
+    return seen, others
+
+
+def test_processes_that_render_scenes_load_no_pytorch(known):
+    seen, others = loaded(known, [name for name in known if name.split(".")[0] == GENERATOR])
+    assert "nerfdiff.poses" in seen and "numpy" in others and not {"torch", "lightning", "torchvision"} & others
+
+
+def test_commands_that_only_compose_load_little(known):
+    """`--cfg job`, `--help` and mistakes in the overrides are answered at once."""
+    seen, others = loaded(known, [name for name in known if name.startswith("nerfdiff.commands.")] + ["nerfdiff"])
+    assert "nerfdiff.cli" in seen and "hydra" in others <= {*LIGHT, *sys.stdlib_module_names}
 
 
 def test_knots_and_imports_upwards_are_seen(tmp_path):

@@ -3,6 +3,7 @@ import json
 import os
 import re
 import struct
+import sys
 import zlib
 from pathlib import Path
 
@@ -267,6 +268,14 @@ def test_empty_folders_and_failures_alone_make_pages_that_say_so(tmp_path):
         chart(tmp_path / "nowhere")
     with pytest.raises(ConfigError, match="names nothing"):
         chart([])
+
+
+@pytest.mark.parametrize("missing", ["plotly.offline", "itables"])
+def test_a_missing_library_is_named_and_the_tables_are_there(tmp_path, monkeypatch, missing):
+    monkeypatch.setitem(sys.modules, missing, None)
+    with pytest.raises(ConfigError, match="pip install plotly itables"):
+        chart(write_results(tmp_path, result("good")))
+    assert list(tmp_path.rglob("configurations.csv")) and not list(tmp_path.rglob("index.html"))
 
 
 def test_several_results_make_one_page(tmp_path):

@@ -69,7 +69,8 @@ def build_chart(cfg: DictConfig) -> Path:
     Raises:
         DataError: there is no such file or folder, or a file of results has no row that can be read (of files found
             within a folder the page says so instead, as long as others can be read; as it does of single lines).
-        ConfigError: the file of published values cannot be read, or they are inconsistent.
+        ConfigError: the file of published values cannot be read, or they are inconsistent; or plotly or itables is not
+            installed, which only the page needs: tables and pictures are written before it.
     """
     places = _places(cfg.results)
     found = _read(places)
@@ -89,6 +90,9 @@ def build_chart(cfg: DictConfig) -> Path:
     page = out / "index.html"
     small = SmallSheets(**_plain(cfg.pictures), warn=found.warn)
     values = _values(out, content, published, failed, small)
+    write_csv(out / "configurations.csv", CONFIGURATION_COLUMNS, map(configuration_line, content.found))
+    write_csv(out / "runs.csv", ("results", *COLUMNS), run_lines(found.runs))
+    pictures = _pngs(cfg, out, content, published)
     counts = f"{len(found.runs)} runs, {len(content.found)} configurations, {len(failed)} failed runs"
     write_page(
         page,
@@ -104,9 +108,6 @@ def build_chart(cfg: DictConfig) -> Path:
             "empty": _nothing(places, found, len(content.found)),
         },
     )
-    write_csv(out / "configurations.csv", CONFIGURATION_COLUMNS, map(configuration_line, content.found))
-    write_csv(out / "runs.csv", ("results", *COLUMNS), run_lines(found.runs))
-    pictures = _pngs(cfg, out, content, published)
     log.info("page: %s   beside it: configurations.csv, runs.csv and %d PNGs", page, len(pictures))
     return page
 

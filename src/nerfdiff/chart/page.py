@@ -7,10 +7,8 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-import itables
-from plotly.offline import get_plotlyjs
-
 from nerfdiff.chart.payload import to_json
+from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.files import write_text
 
 PARTS = Path(__file__).parent / "page"
@@ -22,6 +20,7 @@ def write_page(path: Path, title: str, content: dict[str, Any]) -> None:
 
     Raises:
         DataError: the file cannot be written.
+        ConfigError: plotly or itables is not installed.
     """
     libraries = _libraries() if content["panels"] else dict.fromkeys(("plotly", "table_style", "table_script"), "")
     parts = {
@@ -35,6 +34,11 @@ def write_page(path: Path, title: str, content: dict[str, Any]) -> None:
 
 def _libraries() -> dict[str, str]:
     """What draws charts and tables; a page that has neither goes without these megabytes."""
+    try:
+        import itables
+        from plotly.offline import get_plotlyjs
+    except ImportError as error:
+        raise ConfigError(f"the chart's page needs plotly and itables ({error}): pip install plotly itables") from error
     tables = files(itables) / "html"
     return {
         "plotly": get_plotlyjs().replace("</script", "<\\/script"),

@@ -257,7 +257,7 @@ def _pieces(measured: Subject, way: Way, one: ViewBatch, setting: dict[str, int]
 
     def encode():
         with torch.no_grad(), measured.autocast():
-            return model.encode(one.source, one.source_cameras, one.near, one.far)
+            return model.encode(one)
 
     encoding = encode()
 

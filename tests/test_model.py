@@ -34,15 +34,13 @@ def test_small_models_share_the_structure():
 def test_images_need_not_be_square():
     net = model()
     cameras = input_cameras(2, 12, 20)
-    encoding = net.encode(torch.rand(2, 3, 12, 20), cameras, torch.full((2,), 0.8), torch.full((2,), 1.8))
+    encoding = net.encode_images(torch.rand(2, 3, 12, 20), cameras, torch.full((2,), 0.8), torch.full((2,), 1.8))
     rendering = net.render(encoding, cameras[:, None])
     assert encoding.triplane.planes.shape == (2, 3, 8, 12, 20)
-    assert rendering.rgb.shape == (2, 1, 12, 20, 3)
+    assert rendering.images.shape == (2, 1, 3, 12, 20)
     z = torch.randn(2, 3, 12, 20)
     assert (
-        net.denoiser(
-            z, torch.full((2,), 0.3), net.condition(encoding, cameras[:, None], rendering.rgb.movedim(-1, 2))
-        ).shape
+        net.denoiser(z, torch.full((2,), 0.3), net.condition(encoding, cameras[:, None], rendering.images)).shape
         == z.shape
     )
 
@@ -51,8 +49,8 @@ def test_scenes_of_a_batch_do_not_mix():
     net = model()
     cameras, near, far = input_cameras(3), torch.full((3,), 0.8), torch.full((3,), 1.8)
     source = torch.rand(3, 3, 16, 16)
-    together = net.render(net.encode(source, cameras, near, far), cameras[:, None]).rgb
+    together = net.render(net.encode_images(source, cameras, near, far), cameras[:, None]).images
     for i in range(3):
         one = slice(i, i + 1)
-        alone = net.encode(source[one], cameras[one], near[one], far[one])
-        torch.testing.assert_close(net.render(alone, cameras[one, None]).rgb, together[one], atol=1e-5, rtol=0)
+        alone = net.encode_images(source[one], cameras[one], near[one], far[one])
+        torch.testing.assert_close(net.render(alone, cameras[one, None]).images, together[one], atol=1e-5, rtol=0)

@@ -8,12 +8,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfdiff.cameras import Cameras
+from nerfdiff.data.batch import ViewBatch
 from nerfdiff.diffusion.denoiser import Condition, Denoiser
 from nerfdiff.field.encoder import Encoding
-from nerfdiff.field.field import PixelField, TriplaneField
+from nerfdiff.field.field import Field, PixelField, TriplaneField
 from nerfdiff.field.kinds import TRIPLANE, encoder_and_decoder
 from nerfdiff.field.triplane import Triplane
-from nerfdiff.render.renderer import Renderer, Rendering
+from nerfdiff.render.renderer import RenderedViews, Renderer
 from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.timing import timed
 
@@ -47,8 +48,12 @@ class NerfDiff(nn.Module):
         self.renderer = Renderer(**render)
         self.denoiser = Denoiser(**conditioning, unet=unet)
 
+    def encode(self, batch: ViewBatch) -> Encoding:
+        """Encode a batch's source views, see `encode_images`."""
+        return self.encode_images(batch.source, batch.source_cameras, batch.near, batch.far)
+
     @timed("encode")
-    def encode(
+    def encode_images(
         self,
         source: Float[Tensor, "batch 3 height width"],
         cameras: Cameras,
@@ -64,7 +69,7 @@ class NerfDiff(nn.Module):
         keys_values = self.denoiser.unet.keys_values(encoding.context) if self.denoiser.cross_attention else []
         return replace(encoding, context=keys_values)
 
-    def field(self, encoding: Encoding) -> TriplaneField | PixelField:
+    def field(self, encoding: Encoding) -> Field:
         """The radiance field of each scene."""
         make = TriplaneField if isinstance(encoding.features, Triplane) else PixelField.of
         return make(encoding.features, self.decoder)
@@ -74,8 +79,8 @@ class NerfDiff(nn.Module):
         encoding: Encoding,
         cameras: Cameras,
         jitter: Float[Tensor, "batch n samples"] | None = None,
-    ) -> Rendering:
-        """Render views [batch, views] given in the input cameras' space: leading shape [batch, views, h, w]."""
+    ) -> RenderedViews:
+        """Render views [batch, views] given in the input cameras' space."""
         frustum = encoding.features
         return self.renderer.render_views(self.field(encoding), cameras, frustum.near, frustum.far, jitter)
 

@@ -90,7 +90,7 @@ def test_every_teacher_fits_the_field_and_leaves_the_model_alone(teacher):
     assert all(torch.equal(before[name], value) for name, value in net.state_dict().items())
     assert not any(parameter.requires_grad for parameter in net.parameters())
     with torch.no_grad():
-        start = net.encode(scene().source, scene().source_cameras, scene().near, scene().far).triplane.planes
+        start = net.encode(scene()).triplane.planes
     assert not torch.allclose(module.field.planes, start)
     again = distillation(TEACHERS[teacher]).distil(net, [scene()], seed=0)
     assert torch.equal(again.field.planes, module.field.planes)
@@ -133,7 +133,7 @@ def test_a_scene_that_fails_leaves_the_others_alone():
     alone = distillation(TEACHERS["direct"]).distil(net, [scene("a")], seed=0)
     assert module.statuses == ["ok", "non-finite"] and bool(module.field.finite().all())
     torch.testing.assert_close(module.field.planes[:1], alone.field.planes)
-    start = net.encode(scene().source, scene().source_cameras, scene().near, scene().far).triplane.planes
+    start = net.encode(scene()).triplane.planes
     assert torch.equal(module.field.planes[1:], start)  # it failed at once: what was good is where it began
 
 
@@ -246,7 +246,7 @@ def test_the_input_image_is_fitted_where_asked():
     def error(fit_source):
         module = distillation(guided(1.0, "constant"), inner_steps=60, fit_source=fit_source).distil(net, [scene()], 0)
         with torch.no_grad():
-            image = module.field.render(net.renderer, module.field.cameras[None]).rgb[0, 0].movedim(-1, 0)
+            image = module.field.render(net.renderer, module.field.cameras[None]).images[0, 0]
         return float((image - scene().source[0]).square().mean())
 
     assert error(True) < 0.8 * error(False)
@@ -294,7 +294,7 @@ class Failing:
 
 def starting_planes(net):
     with torch.no_grad():
-        return net.encode(scene().source, scene().source_cameras, scene().near, scene().far).triplane.planes
+        return net.encode(scene()).triplane.planes
 
 
 def test_a_field_that_blows_up_falls_back_to_the_last_finite_one():
@@ -324,7 +324,7 @@ def test_what_was_finite_before_it_failed_must_stand_the_same_test(tolerance, at
     module = method.distil(net, [white], seed=0)
     assert module.statuses == ["non-finite" if at == 4 else "diverged" if tolerance < 1 else "ok"]
     with torch.no_grad():
-        start = net.encode(white.source, white.source_cameras, white.near, white.far).triplane.planes
+        start = net.encode(white).triplane.planes
     assert torch.equal(module.field.planes, start) == (tolerance < 1)
 
 
@@ -360,5 +360,5 @@ def test_a_field_made_worse_falls_back_to_where_it_began():
     net = model().requires_grad_(False)
     module = distillation(TEACHERS["direct"], lr_planes=1e4).distil(net, [scene()], seed=0)
     with torch.no_grad():
-        start = net.encode(scene().source, scene().source_cameras, scene().near, scene().far).triplane.planes
+        start = net.encode(scene()).triplane.planes
     assert module.statuses == ["diverged"] and torch.equal(module.field.planes, start)

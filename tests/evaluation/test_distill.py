@@ -154,7 +154,7 @@ def test_the_field_in_the_file_is_the_one_whose_views_were_saved(precision, data
     folder = scene_folder(tmp_path, "ngd", "scene1")
     saved = load_field(folder / FIELD)
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16-mixed"):
-        images = saved.field.render(saved.renderer, scene.target_cameras).rgb[0].movedim(-1, 1)
+        images = saved.field.render(saved.renderer, scene.target_cameras).images[0]
     pixels = read_prediction(folder.parent, "scene1").pixels
     assert (pixels / 255 - images.float().clamp(0, 1)).abs().max() < (0.51 if precision == "32-true" else 2.0) / 255
 

@@ -12,6 +12,7 @@ from nerfdiff.diffusion.deep_features import DeepFeatures
 from nerfdiff.diffusion.schedule import alpha_sigma, expand, x0_from_v
 from nerfdiff.diffusion.unet import Context, UNet
 from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.images import to_signed
 
 IMAGES = ("rendered", "source", "none")
 
@@ -101,7 +102,7 @@ class Denoiser(nn.Module):
         """
         inputs = [z]
         if self.image != "none":
-            inputs.append(2 * getattr(condition, self.image) - 1)
+            inputs.append(to_signed(getattr(condition, self.image)))
         if self.ray_maps:
             rays = condition.cameras.rays(condition.near, condition.near)
             origins = rays.origins / rays.near[..., None]
@@ -113,7 +114,7 @@ class Denoiser(nn.Module):
         if self.residual_std is None:
             return output
         alpha, sigma = (expand(c, z) for c in alpha_sigma(t))
-        mean, scale = gaussian_velocity(z, 2 * condition.rendered - 1, self.residual_std, alpha, sigma)
+        mean, scale = gaussian_velocity(z, to_signed(condition.rendered), self.residual_std, alpha, sigma)
         return mean + scale * output
 
     def forward(

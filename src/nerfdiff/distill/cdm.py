@@ -16,6 +16,7 @@ from nerfdiff.distill.strategy import Views
 from nerfdiff.distill.virtual_views import Images, VirtualViews
 from nerfdiff.field.encoder import Encoding
 from nerfdiff.model import NerfDiff
+from nerfdiff.utils.images import to_unit
 
 
 def sample_views(
@@ -44,7 +45,7 @@ def sample_views(
     times = time_steps(steps, t_max, t_min, spacing, device=views.encoding.source.device)
     run, kept = make_sampler(sampler, eta), views.reusing(deep)
     x0 = sample(lambda z, t: views.denoise(z, t.expand(len(z)), deep=kept), views.noise(), times, run, views.noise)
-    return 0.5 * (x0 + 1)
+    return to_unit(x0)
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class IndependentViews:
     ) -> list[Views]:
         predicted = []
         for scene in scenes:
-            encoding = model.encode(scene.source, scene.source_cameras, scene.near, scene.far)
+            encoding = model.encode(scene)
             images = self.sample(model, encoding, scene.target_cameras, (seed, "cdm", *scene.scene_ids))[0]
             rendered = model.renderer.samples_per_ray * images[:, 0].numel()  # the CDM's condition
             predicted.append(Views(images, denoiser_calls=self.steps * len(images), field_queries=rendered))

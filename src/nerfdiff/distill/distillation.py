@@ -86,7 +86,7 @@ class Distillation:
         seeds = [(seed, "distil", *scene.scene_ids) for scene in scenes]
         with torch.no_grad():
             # One by one, so that a scene's numbers do not depend on its company.
-            encodings = [model.encode(s.source, s.source_cameras, s.near, s.far) for s in scenes]
+            encodings = [model.encode(scene) for scene in scenes]
         triplane = Triplane.join([encoding.triplane for encoding in encodings])
         views = [
             VirtualViews(model, encoding, self.prior(scene), self.views_at_once, own)

@@ -242,7 +242,7 @@ class NGDModule(LightningModule):
         rendering = self.field.render(renderer, cameras, keep_coarse=remember)
         if rendering.coarse is not None:
             self._batches.remember(rendering.coarse)
-        images = rendering.rgb.movedim(-1, 2)
+        images = rendering.images
         for views in self.views:
             views.field_queries += renderer.samples_per_ray * images[0, :, 0].numel()
         return images

@@ -12,6 +12,7 @@ from nerfdiff.diffusion.schedule import add_noise, alpha_sigma
 from nerfdiff.distill.teacher import sees_current
 from nerfdiff.distill.virtual_views import Images, VirtualViews
 from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.images import to_signed, to_unit
 
 SCHEDULES = ("snr", "constant", "linear")
 COMPARISONS = ("current", "last")
@@ -108,7 +109,7 @@ class GuidedViews:
         self.times = self._host_times.to(views.encoding.source.device)
         self.t: float | None = None
         self.weight: float | None = None
-        self._last = 2 * views.first_renderings - 1
+        self._last = to_signed(views.first_renderings)
         # Algorithm 1 begins with the renderings, noised: for t_max = 1 that is noise alone
         self._z = add_noise(self._last, views.noise(), *alpha_sigma(self.times[0]))
 
@@ -116,9 +117,9 @@ class GuidedViews:
         t, t_next = self.times[step], self.times[step + 1]
         condition = rendered if self.on_current else None
         x0 = self.views.denoise(self._z, t.expand(len(self._z)), condition, self._deep)
-        self._last = self.guidance(x0, 2 * rendered - 1, self._last, t)
+        self._last = self.guidance(x0, to_signed(rendered), self._last, t)
         recorded = self._host_times[step]
         self.t, self.weight = float(recorded), float(self.guidance.weight(recorded))
         noise = self.views.noise() if self.sampler.needs_noise else None
         self._z = self.sampler.step(self._z, self._last, t, t_next, noise)
-        return 0.5 * (self._last + 1)
+        return to_unit(self._last)

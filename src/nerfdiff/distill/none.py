@@ -27,7 +27,7 @@ class SingleImageNeRF:
     ) -> list[Views]:
         predicted = []
         for scene in scenes:
-            encoding = model.encode(scene.source, scene.source_cameras, scene.near, scene.far)
+            encoding = model.encode(scene)
             if model.field_name == TRIPLANE:
                 field = RefinedField(encoding.triplane, model.decoder)
                 predicted.append(Views.of_field(SavedField(field, model.renderer), scene.target_cameras))

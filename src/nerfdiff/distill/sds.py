@@ -4,6 +4,7 @@ from nerfdiff.diffusion.schedule import add_noise, alpha_sigma, expand
 from nerfdiff.distill.teacher import sees_current
 from nerfdiff.distill.virtual_views import Images, VirtualViews
 from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.images import to_signed, to_unit
 
 
 class DenoisedRenderings:
@@ -32,6 +33,6 @@ class DenoisedRenderings:
     def targets(self, step: int, rendered: Images) -> Images:
         t = self.t_min + (self.t_max - self.t_min) * self.views.uniform()
         alpha, sigma = (expand(c, rendered) for c in alpha_sigma(t))
-        z = add_noise(2 * rendered - 1, self.views.noise(), alpha, sigma)
+        z = add_noise(to_signed(rendered), self.views.noise(), alpha, sigma)
         x0 = self.views.denoise(z, t, rendered if self.on_current else None)
-        return 0.5 * (x0 + 1)
+        return to_unit(x0)

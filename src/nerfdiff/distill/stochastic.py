@@ -9,6 +9,7 @@ from nerfdiff.diffusion.sampler import make_sampler, time_steps
 from nerfdiff.distill.direct import FixedImages
 from nerfdiff.distill.virtual_views import VirtualViews
 from nerfdiff.field.encoder import Encoding
+from nerfdiff.utils.images import to_unit
 from nerfdiff.utils.randomness import generator
 from nerfdiff.utils.timing import timed
 
@@ -63,8 +64,8 @@ class AutoregressiveViews(FixedImages):
                     x0 = model.denoiser(z, t[None], conditions[known]).clamp(-1, 1)
                 views.denoiser_calls += 1
                 z = run.step(z, x0, t, t_next, views.noise_of(view)[None] if run.needs_noise else None)
-            images.append(0.5 * (x0 + 1))
-            encoded = model.encode(images[-1], frustum.cameras, frustum.near, frustum.far)
+            images.append(to_unit(x0))
+            encoded = model.encode_images(images[-1], frustum.cameras, frustum.near, frustum.far)
             encodings.append(model.settled(encoded))  # seen by many steps of many views
         super().__init__(torch.cat(images), steps)
 
@@ -76,4 +77,4 @@ def _condition(views: VirtualViews, encoding: Encoding, known: int, view: int) -
         wanted = wanted.relative_to(views.cameras[:, known - 1 : known])
     with timed("guide"):
         rendering = views.model.render(encoding, wanted)
-    return views.model.condition(encoding, wanted, rendering.rgb.movedim(-1, 2))
+    return views.model.condition(encoding, wanted, rendering.images)

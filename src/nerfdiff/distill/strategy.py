@@ -15,7 +15,7 @@ from nerfdiff.distill.trace import Step
 from nerfdiff.fit.saved_field import SavedField
 from nerfdiff.metrics.depth import z_depth
 from nerfdiff.model import NerfDiff
-from nerfdiff.render.renderer import Renderer, Rendering
+from nerfdiff.render.renderer import RenderedViews, Renderer
 from nerfdiff.utils.timing import timed
 
 
@@ -73,10 +73,10 @@ class Views:
         )
 
     @staticmethod
-    def of_rendering(rendering: Rendering, renderer: Renderer, cameras: Cameras) -> "Views":
+    def of_rendering(rendering: RenderedViews, renderer: Renderer, cameras: Cameras) -> "Views":
         """What `renderer` made of a field that is not kept, of leading shape [1, views, height, width]."""
         return Views(
-            images=rendering.rgb[0].movedim(-1, 1),
+            images=rendering.images[0],
             opacity=rendering.opacity[0],
             depth=z_depth(rendering.depth[0], cameras[0]),
             field_queries=renderer.samples_per_ray * rendering.opacity.numel(),

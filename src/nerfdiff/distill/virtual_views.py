@@ -47,7 +47,7 @@ class VirtualViews:
             chunk = cameras[:, part]
             with timed("guide"):
                 rendering = model.render(encoding, chunk)
-            self._conditions.append(model.condition(encoding, chunk, rendering.rgb.movedim(-1, 2)))
+            self._conditions.append(model.condition(encoding, chunk, rendering.images))
         self._noise = [generator(encoding.source.device, *seed, view) for view in range(len(self))]
         self.denoiser_calls = 0
         self.field_queries = model.renderer.samples_per_ray * self.first_renderings[:, 0].numel()

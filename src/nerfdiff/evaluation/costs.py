@@ -81,7 +81,7 @@ def _backend(subject: Subject) -> str:
         return "torch"
     scene = next(iter(subject.load(subject.scene_ids[:1]))).to(subject.device)
     with subject.autocast():
-        field = model.field(model.encode(scene.source, scene.source_cameras, scene.near, scene.far))
+        field = model.field(model.encode(scene))
         rays = scene.target_cameras[:, 0].rays(scene.near, scene.far)
     chosen = backend.chosen(model.renderer, field, rays)
     if chosen == "torch" and model.renderer.backend == "auto" and cpu_field.suits(field, rays):

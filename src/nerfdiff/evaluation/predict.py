@@ -159,7 +159,7 @@ def orbit_frames(subject: Subject, strategy: Strategy, scene: ViewBatch, saved: 
     cameras = orbit(scene.source_cameras, scene.target_cameras[0], subject.cfg.orbit.frames)[None]
     if saved is not None:
         field = saved.field.to(subject.device)
-        return field.render(saved.renderer, cameras).rgb[0].movedim(-1, 1).cpu()
+        return field.render(saved.renderer, cameras).images[0].cpu()
     frames = scene.source_pixels[:, None].expand(-1, cameras.shape[1], -1, -1, -1)
     view = replace(scene, target_cameras=cameras, target_pixels=frames, target_depth=None, target_mask=None)
     with subject.autocast():

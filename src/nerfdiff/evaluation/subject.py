@@ -25,6 +25,7 @@ from nerfdiff.utils.hashes import sha256_file, sha256_values
 log = logging.getLogger(__name__)
 
 PRECISIONS = ("32-true", "bf16-mixed")
+SAMPLES = ("uniform_samples", "importance_samples")
 
 
 @dataclass(frozen=True)
@@ -86,14 +87,25 @@ def choose_device(name: str) -> torch.device:
     return device
 
 
+def _load(cfg: DictConfig) -> LoadedModel:
+    """Load the model with the renderer's settings of this run; null leaves those of the training."""
+    for name in SAMPLES:
+        if cfg[name] is not None and cfg[name] < 1:
+            raise ConfigError(f"{name}={cfg[name]} must be at least 1, or null for what the model was trained with")
+    renderer = {name: cfg[name] for name in ("backend", "kernel_precision", "chunk", *SAMPLES)}
+    renderer = {name: value for name, value in renderer.items() if value is not None}
+    loaded = load_model(cfg.ckpt, cfg.weights, cfg.paths.assets_dir, renderer)
+    log.info("ckpt=%s", loaded.describe())
+    return loaded
+
+
 def dataset_subject(cfg: DictConfig, device: torch.device) -> Subject:
     """The test scenes of `cfg.data`.
 
     Raises:
         UserError: bad data, config or checkpoint.
     """
-    loaded = load_model(cfg.ckpt, cfg.weights, cfg.paths.assets_dir)
-    log.info("ckpt=%s", loaded.describe())
+    loaded = _load(cfg)
     datamodule = instantiate(cfg.data)
     datamodule.setup("test")
     reader = datamodule.reader("test")
@@ -127,8 +139,7 @@ def picture_subject(cfg: DictConfig, device: torch.device) -> Subject:
     Raises:
         UserError: bad picture, config or checkpoint.
     """
-    loaded = load_model(cfg.ckpt, cfg.weights, cfg.paths.assets_dir)
-    log.info("ckpt=%s", loaded.describe())
+    loaded = _load(cfg)
     size = loaded.image_size or plain(cfg.picture_size)
     if size is None:
         raise ConfigError(f"{loaded.path} does not say what image size it is for: give picture_size=[height,width]")
@@ -160,13 +171,6 @@ def _subject(
     precision = cfg.precision if cfg.precision != "auto" else auto_precision(device.type)
     if precision not in PRECISIONS:
         raise ConfigError(f"precision must be auto, {' or '.join(PRECISIONS)}, got {precision!r}")
-    samples = {
-        name: getattr(loaded.model.renderer, name) if cfg[name] is None else cfg[name]
-        for name in ("uniform_samples", "importance_samples")
-    }
-    for name, number in samples.items():
-        if number < 1:
-            raise ConfigError(f"{name}={number} must be at least 1, or null for what the model was trained with")
     identity = facts | {
         "ckpt_sha256": sha256_file(loaded.path),
         "weights": loaded.weights,
@@ -175,20 +179,13 @@ def _subject(
         "kernel_precision": cfg.kernel_precision,
         "backend": cfg.backend,
         "compile": cfg.compile,
-        "samples": samples,
+        "samples": {name: getattr(loaded.model.renderer, name) for name in SAMPLES},
         "device": device.type,  # whose generators draw the noise
         "orbit": cfg.per_scene and cfg.orbit.frames,
         "strategy": plain(cfg.strategy),
     }
     folder = Path(cfg.paths.output_dir) / f"{cfg.strategy.name}-{sha256_values(identity)[:8]}"
     model = loaded.model.to(device).requires_grad_(False)
-    model.renderer = replace(
-        model.renderer,
-        backend=cfg.backend,
-        kernel_precision=cfg.kernel_precision,
-        chunk=cfg.chunk or model.renderer.chunk,
-        **samples,
-    )
     in_pixels = channels_last(cfg.channels_last, device, cfg.compile != "none")
     if in_pixels:
         model.to(memory_format=torch.channels_last)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nerfdiff.cameras import Rays
-from nerfdiff.field.field import FieldFn, TriplaneField
+from nerfdiff.field.field import Field, TriplaneField
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.utils.precision import full_precision
 
@@ -53,7 +53,7 @@ class Interpolate(torch.autograd.Function):
         return total, None, None, None
 
 
-def suits(field: FieldFn, rays: Rays) -> bool:
+def suits(field: Field, rays: Rays) -> bool:
     """Whether `scene_by_scene` can stand for this field along these rays.
 
     It can on a CPU, in fp32 (float64 is for references), where gradients go to planes and decoder alone.
@@ -104,7 +104,10 @@ class CpuField:
     weight: Float[Tensor, "4 hidden"]
     bias: Float[Tensor, "4"]
 
-    def __call__(self, points: Float[Tensor, "1 n 3"]) -> tuple[Float[Tensor, "1 n 3"], Float[Tensor, "1 n"]]:
+    def __call__(
+        self, points: Float[Tensor, "1 n 3"], directions: Float[Tensor, "1 n 3"] | None = None
+    ) -> tuple[Float[Tensor, "1 n 3"], Float[Tensor, "1 n"]]:
+        """See `Field`; the colour is the same from all directions."""
         with full_precision(points.device):
             coordinates, valid = self.field.triplane.frustum_coordinates(points)
             hidden = F.silu(Interpolate.apply(self.table, *self._cells(coordinates[0])))

@@ -13,6 +13,7 @@ from nerfdiff.field.resnet import ResNetPyramid
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.field.vision_features import VisionFeatures
 from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.images import to_signed
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class Encoder(nn.Module):
         far: Float[Tensor, "batch"],
     ) -> Encoding:
         """Encode input images in [0, 1] seen by `cameras` [batch]."""
-        out, features = self.unet(2 * source - 1)
+        out, features = self.unet(to_signed(source))
         planes = out.float().unflatten(1, (3, self.channels))
         return Encoding(source, Triplane(planes, cameras, near, far), features)
 
@@ -87,6 +88,6 @@ class PixelEncoder(nn.Module):
         far: Float[Tensor, "batch"],
     ) -> Encoding:
         """Encode input images in [0, 1] seen by `cameras` [batch]."""
-        image = 2 * source - 1
+        image = to_signed(source)
         maps = (self.backbone(image).float(), *([image] if self.with_image else []))
         return Encoding(source, PixelFeatures(maps, cameras, near, far), [])

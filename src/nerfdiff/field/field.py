@@ -1,7 +1,7 @@
 """A radiance field: what the renderer calls at points."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F
@@ -13,9 +13,20 @@ from nerfdiff.field.pixel_features import PixelFeatures
 from nerfdiff.field.residual_mlp import ResidualMLP
 from nerfdiff.field.triplane import Triplane
 
-# points [batch, n, 3] -> (colour [batch, n, 3] in [0, 1], density [batch, n] per scene unit)
-FieldFn = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""A `PixelField` stands for one too; the renderer gives it directions beside the points."""
+
+@runtime_checkable
+class Field(Protocol):
+    """Colour and density of points seen along directions: all that the renderer asks of a radiance field."""
+
+    def __call__(
+        self, points: Float[Tensor, "batch n 3"], directions: Float[Tensor, "batch n 3"]
+    ) -> tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n"]]:
+        """Return colours in [0, 1] and densities per scene unit.
+
+        Args:
+            points: in the input camera's space, in scene units.
+            directions: unit direction of each point's ray, in the same space; a field may ignore them.
+        """
 
 
 @dataclass(frozen=True)
@@ -26,8 +37,9 @@ class TriplaneField:
     decoder: Decoder
 
     def __call__(
-        self, points: Float[Tensor, "batch n 3"]
+        self, points: Float[Tensor, "batch n 3"], directions: Float[Tensor, "batch n 3"] | None = None
     ) -> tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n"]]:
+        """See `Field`; the colour is the same from all directions."""
         features, valid = self.triplane.sample(points)
         rgb, density = self.decoder(features)
         return rgb, self.per_scene_unit(density, valid)
@@ -71,7 +83,7 @@ class PixelField:
     def __call__(
         self, points: Float[Tensor, "batch n 3"], directions: Float[Tensor, "batch n 3"]
     ) -> tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n"]]:
-        """As a `FieldFn`, given the unit direction of each point's ray in the input camera's space too."""
+        """See `Field`."""
         sampled, valid = self.features.sample(points)
         _, injected = self.decoder.injection()
         parts = sampled.split([one.shape[1] for one in self.features.maps], -1)

@@ -8,7 +8,7 @@ from nerfdiff.cameras import Cameras
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.field import TriplaneField
 from nerfdiff.field.triplane import Triplane
-from nerfdiff.render.renderer import Renderer, Rendering
+from nerfdiff.render.renderer import RenderedViews, Renderer
 
 
 class RefinedField(nn.Module):
@@ -44,8 +44,8 @@ class RefinedField(nn.Module):
         """Colour and density of points in the input camera's space."""
         return TriplaneField(self.triplane, self.decoder)
 
-    def render(self, renderer: Renderer, cameras: Cameras, keep_coarse: bool = False) -> Rendering:
-        """Whole images of cameras [scenes, views]: leading shape [scenes, views, height, width].
+    def render(self, renderer: Renderer, cameras: Cameras, keep_coarse: bool = False) -> RenderedViews:
+        """Render whole images of cameras [scenes, views].
 
         Args:
             keep_coarse: as `Renderer.render`'s.

@@ -115,7 +115,7 @@ class Consistency:
         with torch.enable_grad():
             self._fit(fresh, renderer, batches, generator(device, self.seed, "consistency", scene_id, "rays"))
         with torch.no_grad():
-            rendered = fresh.render(renderer, cameras[held_out][None]).rgb[0].movedim(-1, 1)
+            rendered = fresh.render(renderer, cameras[held_out][None]).images[0]
         return psnr(rendered.clamp(0, 1), dequantise(pixels[held_out])).mean().item()
 
     def _fresh(self, source: Cameras, near: Tensor, far: Tensor, seed: tuple[int | str, ...]) -> RefinedField:

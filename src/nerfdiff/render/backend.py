@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nerfdiff.cameras import Rays
 from nerfdiff.field.decoder import Decoder
-from nerfdiff.field.field import FieldFn, TriplaneField
+from nerfdiff.field.field import Field, TriplaneField
 from nerfdiff.render.agreement import Probe, disagreement, in_any_order
 from nerfdiff.render.reference_gradients import reference_gradients
 from nerfdiff.utils.errors import ConfigError
@@ -56,7 +56,7 @@ def check_choice(backend: str, kernel_precision: str) -> None:
 @torch.compiler.disable
 def fused(
     renderer,
-    field: FieldFn,
+    field: Field,
     rays: Rays,
     jitter: Float[Tensor, "batch n samples"] | None,
     coarse: Float[Tensor, "batch n bins"] | None = None,
@@ -81,13 +81,13 @@ def fused(
     return None
 
 
-def chosen(renderer, field: FieldFn, rays: Rays) -> str:
+def chosen(renderer, field: Field, rays: Rays) -> str:
     """What renders these rays, `torch` or `triton`; certain once they were rendered, as kernels may not compile."""
     fits = _wanted(renderer, field, rays) and _obstacle(renderer, field, rays, None, None) is None
     return "triton" if fits else "torch"
 
 
-def _wanted(renderer, field: FieldFn, rays: Rays) -> bool:
+def _wanted(renderer, field: Field, rays: Rays) -> bool:
     if renderer.backend == "auto":
         return rays.near.is_cuda and isinstance(field, TriplaneField)
     return renderer.backend == "triton"
@@ -142,7 +142,7 @@ def _interpreted() -> bool:
     return INTERPRETED
 
 
-def _obstacle(renderer, field: FieldFn, rays: Rays, jitter: Tensor | None, coarse: Tensor | None) -> str | None:
+def _obstacle(renderer, field: Field, rays: Rays, jitter: Tensor | None, coarse: Tensor | None) -> str | None:
     """Why the kernels cannot render this as the reference does."""
     if type(field) is not TriplaneField or type(field.decoder) is not Decoder:
         return "the field is not a triplane with this project's decoder"

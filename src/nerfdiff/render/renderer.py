@@ -10,7 +10,7 @@ from torch.utils.checkpoint import checkpoint
 
 from nerfdiff.cameras import Cameras, Rays
 from nerfdiff.field import cpu_field
-from nerfdiff.field.field import FieldFn, PixelField
+from nerfdiff.field.field import Field
 from nerfdiff.render.backend import check_choice, fused
 from nerfdiff.render.sampling import (
     KEPT,
@@ -45,6 +45,20 @@ class Rendering:
     opacity: Float[Tensor, "*rays"]
     depth: Float[Tensor, "*rays"]
     coarse: Float[Tensor, "*rays bins"] | None = None
+
+
+@dataclass(frozen=True)
+class RenderedViews:
+    """Whole images; `opacity`, `depth` and `coarse` are those of a `Rendering`.
+
+    Args:
+        images: colour over the background, in [0, 1].
+    """
+
+    images: Float[Tensor, "batch views 3 height width"]
+    opacity: Float[Tensor, "batch views height width"]
+    depth: Float[Tensor, "batch views height width"]
+    coarse: Float[Tensor, "batch views height width bins"] | None = None
 
 
 @dataclass(frozen=True)
@@ -84,7 +98,7 @@ class Renderer:
 
     def render(
         self,
-        field: FieldFn,
+        field: Field,
         rays: Rays,
         jitter: Float[Tensor, "batch n samples"] | None = None,
         coarse: Float[Tensor, "batch n bins"] | None = None,
@@ -122,20 +136,17 @@ class Renderer:
 
     def render_views(
         self,
-        field: FieldFn,
+        field: Field,
         cameras: Cameras,
         near: Float[Tensor, "batch"],
         far: Float[Tensor, "batch"],
         jitter: Float[Tensor, "batch n samples"] | None = None,
         keep_coarse: bool = False,
-    ) -> Rendering:
+    ) -> RenderedViews:
         """Render whole images of cameras [batch, views], given in the input cameras' space.
 
         Args:
             jitter, keep_coarse: as `render`'s.
-
-        Returns:
-            A rendering of leading shape [batch, views, height, width].
         """
         rays = cameras.rays(near[:, None], far[:, None])
         shape = torch.broadcast_shapes(rays.near.shape, rays.directions.shape[:-1])
@@ -147,7 +158,8 @@ class Renderer:
         )
         out = self.render(field, flat, jitter, keep_coarse=keep_coarse)
         coarse = None if out.coarse is None else out.coarse.reshape(*shape, -1)
-        return Rendering(out.rgb.reshape(*shape, 3), out.opacity.reshape(shape), out.depth.reshape(shape), coarse)
+        images = out.rgb.reshape(*shape, 3).movedim(-1, 2)
+        return RenderedViews(images, out.opacity.reshape(shape), out.depth.reshape(shape), coarse)
 
     def _check_coarse(self, rays, jitter, coarse, keep_coarse):
         if keep_coarse and (coarse is not None or jitter is not None):
@@ -216,11 +228,8 @@ class Renderer:
     @staticmethod
     def _query(field, rays, distances):
         points = rays.at(distances)
-        if isinstance(field, PixelField):
-            directions = rays.directions[..., None, :].expand(points.shape)
-            rgb, density = field(points.flatten(1, 2), directions.flatten(1, 2))
-        else:
-            rgb, density = field(points.flatten(1, 2))
+        directions = rays.directions[..., None, :].expand(points.shape)
+        rgb, density = field(points.flatten(1, 2), directions.flatten(1, 2))
         return rgb.reshape(*points.shape), density.reshape(points.shape[:-1])
 
 

@@ -199,9 +199,9 @@ def _step(model: NerfDiff, batch_size: int, target_views: int, height: int, widt
     views = Cameras(c2w, K, height, width)
     jitter = torch.empty(batch_size, target_views * height * width, model.renderer.samples_per_ray)
 
-    encoding = model.encode(source, cameras, bounds, bounds)
+    encoding = model.encode_images(source, cameras, bounds, bounds)
     rendering = model.render(encoding, views, jitter)
-    condition = model.condition(encoding, views, rendering.rgb.movedim(-1, 2))
+    condition = model.condition(encoding, views, rendering.images)
     velocity = model.denoiser.velocity(targets, targets.new_empty(len(targets)), condition)
     (F.mse_loss(condition.rendered, targets) + F.mse_loss(velocity, targets)).backward()
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -28,6 +29,7 @@ from nerfdiff.results.environment import git_state
 from nerfdiff.training.callbacks.progress import share_of_time, timer_of
 from nerfdiff.training.kept_renderings import KeptRenderings
 from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.images import to_signed
 from nerfdiff.utils.randomness import generator, spread_times
 
 WHOLE = {"ray_share": 1.0, "through_rendering": True}
@@ -49,6 +51,7 @@ class NerfDiffModule(LightningModule):
         channels_last: memory layout of the U-Nets.
         seed: of all noise; see `nerfdiff.utils.randomness`.
         kept_renderings: folder where a frozen field's renderings are kept, instead of being made at every step.
+        renderer: `backend` and `kernel_precision` of the `Renderer`, which suit a machine and are not saved.
 
     Raises:
         ConfigError: losses that train nothing, or that ask for gradients which are not computed.
@@ -63,12 +66,13 @@ class NerfDiffModule(LightningModule):
         channels_last: bool,
         seed: int,
         kept_renderings: str | None = None,
+        renderer: Mapping = MappingProxyType({}),
     ):
         super().__init__()
         losses = WHOLE | losses
         _check_losses(losses, kept_renderings)
-        self.save_hyperparameters(ignore=["kept_renderings"])
-        self.model = NerfDiff(**model)
+        self.save_hyperparameters(ignore=["kept_renderings", "renderer"])
+        self.model = NerfDiff(**model | {"render": {**model["render"], **renderer}})
         self.frozen_field = losses["lambda_ic"] == 0
         self._kept_folder, self._kept = kept_renderings, None
         self.begun_from: str | None = None  # SHA-256 of `init`'s weights
@@ -87,7 +91,7 @@ class NerfDiffModule(LightningModule):
         losses = WHOLE | self.hparams.losses
         encode = torch.no_grad() if self.frozen_field else nullcontext()
         with encode:
-            encoding = self.model.encode(batch.source, batch.source_cameras, batch.near, batch.far)
+            encoding = self.model.encode(batch)
         noise = self._noise(batch, losses)
         loss_ic, rendering = self._photometric(batch, encoding, noise, losses)
         loss = losses["lambda_ic"] * loss_ic
@@ -103,9 +107,9 @@ class NerfDiffModule(LightningModule):
         return loss
 
     def validation_step(self, batch: ViewBatch, batch_idx: int) -> None:
-        encoding = self.model.encode(batch.source, batch.source_cameras, batch.near, batch.far)
+        encoding = self.model.encode(batch)
         rendering = self.model.render(encoding, batch.target_cameras)
-        rendered = rendering.rgb.movedim(-1, 2)
+        rendered = rendering.images
         self.log_dict(
             {
                 "val/psnr": psnr(rendered.flatten(0, 1), batch.targets.flatten(0, 1)).mean(),
@@ -115,7 +119,7 @@ class NerfDiffModule(LightningModule):
             sync_dist=True,
         )
         condition = self.model.condition(encoding, batch.target_cameras, rendered)
-        targets = 2 * batch.targets.flatten(0, 1) - 1
+        targets = to_signed(batch.targets.flatten(0, 1))
         eps = torch.randn(targets.shape, generator=generator("cpu", self.hparams.seed, "validation", batch_idx))
         losses = [
             self._denoising_loss(condition, targets, eps.to(targets), targets.new_full((len(targets),), t))
@@ -205,7 +209,7 @@ class NerfDiffModule(LightningModule):
             return F.mse_loss(rendered, batch.targets), rendered
         whole = losses["ray_share"] == 1
         if whole:
-            rendered = self.model.render(encoding, batch.target_cameras, noise["jitter"]).rgb.movedim(-1, 2)
+            rendered = self.model.render(encoding, batch.target_cameras, noise["jitter"]).images
             loss_ic = F.mse_loss(rendered, batch.targets)
         else:
             loss_ic = self._on_some_rays(batch, encoding, noise["rays"], noise["jitter"])
@@ -239,7 +243,7 @@ class NerfDiffModule(LightningModule):
     def _rendered(self, batch: ViewBatch, encoding: Encoding) -> Float[Tensor, "batch targets 3 height width"]:
         """Whole targets without gradients or jitter; a frozen field's are kept."""
         if self.kept is None:
-            return self.model.render(encoding, batch.target_cameras).rgb.movedim(-1, 2)
+            return self.model.render(encoding, batch.target_cameras).images
         images = []
         for draw, (scene, source, targets) in enumerate(
             zip(batch.scene_ids, batch.source_views, batch.target_views, strict=True)
@@ -250,7 +254,7 @@ class NerfDiffModule(LightningModule):
             own = replace(encoding, source=encoding.source[one], features=alone)
 
             def render(views: list[int], own: Encoding = own, one: slice = one) -> Tensor:
-                return self.model.render(own, batch.target_cameras[one, views]).rgb[0].movedim(-1, 1)
+                return self.model.render(own, batch.target_cameras[one, views]).images[0]
 
             names = [f"{scene}/{source}/{target}" for target in targets]
             images.append(self.kept.get(names, tuple(batch.targets.shape[-2:]), render))
@@ -259,7 +263,7 @@ class NerfDiffModule(LightningModule):
     def _diffusion(self, batch: ViewBatch, encoding: Encoding, rendered: Tensor, eps: Tensor) -> Tensor:
         """L^DM (paper, eq. "ddpm") on v."""
         condition = self.model.condition(encoding, batch.target_cameras, rendered)
-        targets = 2 * batch.targets.flatten(0, 1) - 1
+        targets = to_signed(batch.targets.flatten(0, 1))
         views = batch.target_cameras.shape[1]
         each = (batch.draws[:, None] * views + torch.arange(views, device=batch.draws.device)).flatten()
         times = spread_times(each, self.hparams.seed)

@@ -3,7 +3,6 @@
 import logging
 import os
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -84,10 +83,10 @@ def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
         channels_last=channels_last(cfg.channels_last, trainer.strategy.root_device, cfg.compile != "none"),
         seed=cfg.seed,
         kept_renderings=_kept_renderings(cfg, datamodule),
+        renderer={"backend": cfg.backend, "kernel_precision": cfg.kernel_precision},
     )
     if last is None:
         _begin(module, cfg, model_config)
-    module.model.renderer = replace(module.model.renderer, backend=cfg.backend, kernel_precision=cfg.kernel_precision)
     compile_unets(module.model, cfg.compile, cfg.paths.compiled_dir)
     _announce(module, last, trainer.strategy.root_device)
     if trainer.is_global_zero and last is not None and last.name != LAST and (last.parent / LAST).exists():

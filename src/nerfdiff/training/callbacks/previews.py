@@ -51,12 +51,12 @@ class Previews(Callback):
     def _pictures(
         self, model: NerfDiff, batch: ViewBatch, seed: int
     ) -> dict[str, Float[Tensor, "views 3 height width"]]:
-        encoding = model.encode(batch.source, batch.source_cameras, batch.near, batch.far)
+        encoding = model.encode(batch)
         rendering = model.render(encoding, batch.target_cameras)
         near, far = float(batch.near[0]), float(batch.far[0])
         pictures = {
             "input": batch.source.expand_as(batch.targets[0]),
-            "render": rendering.rgb[0].movedim(-1, 1),
+            "render": rendering.images[0],
             "depth": colour_depth(rendering.depth[0], near, far, rendering.opacity[0]),
             "cdm": self.sampler.sample(model, encoding, batch.target_cameras, (seed, "preview", *batch.scene_ids))[0],
             "truth": batch.targets[0],

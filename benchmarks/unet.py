@@ -63,7 +63,7 @@ def _denoiser(measured: Subject, views: int, compiled: bool, seconds: float) -> 
     model, one = measured.model, scene(measured, views)
     with measured.autocast():
         encoding = model.encode(one)
-        settled = model.settled(encoding)
+        settled = model.with_keys_values(encoding)
     shown = torch.rand(1, views, 3, measured.size, measured.size, device=measured.device)
     condition = model.condition(encoding, one.target_cameras, shown)
     z = torch.randn(views, 3, measured.size, measured.size, device=measured.device)

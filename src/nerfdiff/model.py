@@ -63,7 +63,7 @@ class NerfDiff(nn.Module):
         """Input images in [0, 1] to triplanes (or a pixel-aligned NeRF's features) and what the CDM attends to."""
         return self.encoder(source, cameras, near, far)
 
-    def settled(self, encoding: Encoding) -> Encoding:
+    def with_keys_values(self, encoding: Encoding) -> Encoding:
         """The same encoding for many calls of the CDM: its features as the keys and values that attention makes of
         them, which depend neither on the view nor on the diffusion step."""
         keys_values = self.denoiser.unet.keys_values(encoding.context) if self.denoiser.cross_attention else []

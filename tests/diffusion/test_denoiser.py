@@ -85,7 +85,7 @@ def test_a_settled_encoding_conditions_as_the_encoding_itself(variant):
         rendering, z = net.render(encoding, wanted), torch.randn(4, 3, 16, 16)
         plain, settled = (
             net.denoiser(z, torch.full((4,), 0.5), net.condition(known, wanted, rendering.images))
-            for known in (encoding, net.settled(encoding))
+            for known in (encoding, net.with_keys_values(encoding))
         )
     torch.testing.assert_close(settled, plain, atol=1e-4, rtol=1e-4)
 

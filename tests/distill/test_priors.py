@@ -9,7 +9,7 @@ import torch
 from nerfdiff.cameras import Cameras
 from nerfdiff.cli import load_config
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.distill.priors import Circle, OwnViews, Prior, Sphere, SRNSpiral, all_cameras, plane_normal
+from nerfdiff.distill.priors import Circle, SceneCameras, Prior, Sphere, SRNSpiral, all_cameras, plane_normal
 from nerfdiff.poses import look_at_origin
 from nerfdiff.trajectories import look_at_point
 from nerfdiff.utils.errors import ConfigError, DataError
@@ -110,14 +110,14 @@ def test_srn_spiral_needs_cameras_that_look_at_one_point_or_a_radius(others):
 def test_own_views_are_the_inputs_and_the_others():
     world = [camera(c) for c in ((2, 0, 1), (0, 2, 1.2), (-2, 0.3, 0.8), (1, -2, 0.5))]
     batch = scene(world)
-    assert torch.equal(OwnViews(30)(batch).c2w[0], all_cameras(batch).c2w)
-    assert torch.equal(OwnViews(2)(batch).c2w[0], all_cameras(batch).c2w[[0, 2]])
+    assert torch.equal(SceneCameras(30)(batch).c2w[0], all_cameras(batch).c2w)
+    assert torch.equal(SceneCameras(2)(batch).c2w[0], all_cameras(batch).c2w[[0, 2]])
 
 
 def test_fewer_views_than_asked_for_are_said_once(caplog):
     batch = scene([camera(c) for c in ((2, 0, 1), (0, 2, 1.2), (-2, 0.3, 0.8))])
     for _ in range(2):
-        assert OwnViews(41)(batch).shape == OwnViews(3)(batch).shape == (1, 3)
+        assert SceneCameras(41)(batch).shape == SceneCameras(3)(batch).shape == (1, 3)
     assert len(caplog.messages) == 1
     assert "3 virtual views instead of the 41 of budget.views" in caplog.messages[0]
     assert "data.eval_stride" in caplog.messages[0]
@@ -197,7 +197,7 @@ def test_part_of_the_sphere_stays_on_the_inputs_side():
 
 
 def test_all_are_priors():
-    for prior in (SRNSpiral(5, 64, None), OwnViews(5), Circle(5), Sphere(5, (0.0, 1.0), (0.0, 1.0), 0.0)):
+    for prior in (SRNSpiral(5, 64, None), SceneCameras(5), Circle(5), Sphere(5, (0.0, 1.0), (0.0, 1.0), 0.0)):
         assert isinstance(prior, Prior)
 
 

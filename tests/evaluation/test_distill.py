@@ -108,7 +108,7 @@ def test_k_is_the_number_of_views_that_fields_were_fitted_to(data, run, tmp_path
     for stride, asked, used in ((1, 4, 4), (1, 9, 5), (2, 9, 3)):
         settings = "prior=abo_views", f"budget.views={asked}", f"data.eval_stride={stride}", *small
         row = distill(config(data, run, tmp_path, *settings))
-        assert (row.K, row.prior) == (used, "OwnViews")
+        assert (row.K, row.prior) == (used, "SceneCameras")
         assert row.denoiser_calls == 2 * 2 * used  # scenes, steps
         assert (f"{used} virtual views instead of the {asked}" in caplog.text) == (used < asked)
     none = distill(config(data, run, tmp_path, "strategy=none", *small))

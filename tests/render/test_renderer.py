@@ -218,9 +218,7 @@ def test_gradients_reach_planes_through_importance_samples_as_through_fixed_ones
 
     renderer(6, 6).render(remember, bundle)
     replay = iter(seen)
-    frozen = renderer(6, 6).render(
-        lambda points, _: _at(moved, still, points, next(replay), len(seen)), bundle
-    )
+    frozen = renderer(6, 6).render(lambda points, _: _at(moved, still, points, next(replay), len(seen)), bundle)
     change = (frozen.rgb - target).square().sum() - (out.rgb - target).square().sum()
     assert change.item() == pytest.approx((gradient * step).sum().item(), rel=2e-2)
 

@@ -6,6 +6,7 @@ guided: the guided x̃0 goes in where x0 does.
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Protocol, runtime_checkable
 
@@ -13,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfdiff.diffusion.deep_features import DeepReuse
 from nerfdiff.diffusion.schedule import alpha_sigma, eps_from_x0
 from nerfdiff.utils.errors import ConfigError
 
@@ -101,6 +103,34 @@ def half_log_snr(t: Tensor) -> Tensor:
 
 SAMPLERS = ("ddim", "dpmpp_2m")
 SPACINGS = ("uniform_t", "uniform_lambda")
+
+
+@dataclass(frozen=True)
+class SamplerSettings:
+    """How the reverse process is followed; `conf/common/sampler.yaml` has them.
+
+    Args:
+        t_max, t_min: times where it starts and ends, in [0, 1].
+        spacing: of the times between, `uniform_t` or `uniform_lambda` (see `time_steps`).
+        sampler: `ddim` or `dpmpp_2m`.
+        eta: DDIM's η; 0 is deterministic given the initial noise.
+        deep: how often the U-Net's deep levels are computed; None: at each step.
+    """
+
+    t_max: float
+    t_min: float
+    spacing: str
+    sampler: str
+    eta: float
+    deep: DeepReuse | None = None
+
+    def begin(self) -> Sampler:
+        """Make a sampler for one run, see `make_sampler`."""
+        return make_sampler(self.sampler, self.eta)
+
+    def times(self, steps: int, device=None) -> Float[Tensor, "{steps}+1"]:
+        """Return the times of so many steps, see `time_steps`."""
+        return time_steps(steps, self.t_max, self.t_min, self.spacing, device)
 
 
 def make_sampler(name: str, eta: float) -> Sampler:

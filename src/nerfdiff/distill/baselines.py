@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.scene import SceneReader
-from nerfdiff.distill.strategy import Views
+from nerfdiff.distill.strategy import PredictedViews
 from nerfdiff.model import NerfDiff
 from nerfdiff.utils.randomness import generator
 
@@ -24,8 +24,8 @@ class CopyInput:
 
     def predict(
         self, model: NerfDiff | None, scenes: Sequence[ViewBatch], seed: int, callbacks: Sequence[Callback] = ()
-    ) -> list[Views]:
-        return [Views(scene.source.expand(scene.targets.shape[1], -1, -1, -1)) for scene in scenes]
+    ) -> list[PredictedViews]:
+        return [PredictedViews(scene.source.expand(scene.targets.shape[1], -1, -1, -1)) for scene in scenes]
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,10 @@ class MeanImage:
 
     def predict(
         self, model: NerfDiff | None, scenes: Sequence[ViewBatch], seed: int, callbacks: Sequence[Callback] = ()
-    ) -> list[Views]:
-        def views(scene: ViewBatch) -> Views:
+    ) -> list[PredictedViews]:
+        def views(scene: ViewBatch) -> PredictedViews:
             mean = F.interpolate(self.mean[None], scene.targets.shape[-2:], mode="area")
-            return Views(mean.expand(scene.targets.shape[1], -1, -1, -1).to(scene.source))
+            return PredictedViews(mean.expand(scene.targets.shape[1], -1, -1, -1).to(scene.source))
 
         return [views(scene) for scene in scenes]
 

@@ -90,7 +90,7 @@ def plane_normal(cameras: Cameras) -> Float[Tensor, "3"]:
 
 
 @dataclass(frozen=True)
-class OwnViews:
+class SceneCameras:
     """The input camera and those of the views to predict, spread evenly if there are more than K.
 
     Of these views nothing but the poses is used, which ABO's renders share among all objects. Where there are fewer

@@ -20,7 +20,7 @@ from nerfdiff.utils.timing import timed
 
 
 @dataclass(frozen=True)
-class Views:
+class PredictedViews:
     """Predicted images of one scene's target views, and what they cost to make.
 
     Args:
@@ -55,14 +55,14 @@ class Views:
         field_queries: int = 0,
         trace: Sequence[Step] = (),
         status: str = "ok",
-    ) -> "Views":
+    ) -> "PredictedViews":
         """What a field shows to cameras [1, views].
 
         Args:
             denoiser_calls, field_queries: what it took to make the field; rendering is added here.
         """
         rendering = saved.field.render(saved.renderer, cameras)
-        views = Views.of_rendering(rendering, saved.renderer, cameras)
+        views = PredictedViews.of_rendering(rendering, saved.renderer, cameras)
         return replace(
             views,
             denoiser_calls=denoiser_calls,
@@ -73,9 +73,9 @@ class Views:
         )
 
     @staticmethod
-    def of_rendering(rendering: RenderedViews, renderer: Renderer, cameras: Cameras) -> "Views":
+    def of_rendering(rendering: RenderedViews, renderer: Renderer, cameras: Cameras) -> "PredictedViews":
         """What `renderer` made of a field that is not kept, of leading shape [1, views, height, width]."""
-        return Views(
+        return PredictedViews(
             images=rendering.images[0],
             opacity=rendering.opacity[0],
             depth=z_depth(rendering.depth[0], cameras[0]),
@@ -91,7 +91,7 @@ class Strategy(Protocol):
 
     def predict(
         self, model: NerfDiff | None, scenes: Sequence[ViewBatch], seed: int, callbacks: Sequence[Callback] = ()
-    ) -> list[Views]:
+    ) -> list[PredictedViews]:
         """Images of every target view of each of `scenes`, from its source view alone, whatever the other scenes.
 
         Args:

@@ -35,7 +35,7 @@ class Teacher(Protocol):
 MakeTeacher = Callable[[VirtualViews], Teacher]
 
 
-def sees_current(condition: str) -> bool:
+def uses_current_rendering(condition: str) -> bool:
     """Whether the CDM is conditioned on the field's `current` rendering, rather than on the `first`.
 
     Raises:

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.distill.strategy import Strategy, Views
+from nerfdiff.distill.strategy import PredictedViews, Strategy
 from nerfdiff.distill.trace import PLOT, TRACE, plot_trace, write_trace
 from nerfdiff.evaluation.progress import SceneProgress
 from nerfdiff.evaluation.subject import Subject
@@ -99,7 +99,9 @@ def require_all(subject: Subject, strategy: Strategy) -> None:
         )
 
 
-def _shares(seconds: float, parts: Mapping[str, Sequence[float]], predicted: Sequence[Views]) -> dict[str, float]:
+def _shares(
+    seconds: float, parts: Mapping[str, Sequence[float]], predicted: Sequence[PredictedViews]
+) -> dict[str, float]:
     """Seconds of scenes made together: of an encoding, of rendering a view, and else for each scene as if alone."""
     spent = {"seconds": seconds, "pieces": sum(map(len, parts.values()))}
     spent |= {name: sum(pieces) for name, pieces in parts.items()}
@@ -115,7 +117,7 @@ def _write(
     strategy: Strategy,
     writer: PredictionWriter,
     scene: ViewBatch,
-    views: Views,
+    views: PredictedViews,
     spent: Mapping[str, float],
 ) -> float | None:
     """Save one scene's views, and what was `spent` on it, see `_shares`; their PSNR, if there is a truth."""
@@ -140,7 +142,7 @@ def _write(
     return psnr(views.images.clamp(0, 1), scene.targets[0]).mean().item() if subject.data else None
 
 
-def _leave(subject: Subject, strategy: Strategy, scene: ViewBatch, views: Views, folder: Path) -> None:
+def _leave(subject: Subject, strategy: Strategy, scene: ViewBatch, views: PredictedViews, folder: Path) -> None:
     """The field, its trace and an orbit in the scene's folder; a field that was fitted in any case."""
     if views.field is not None and (views.trace or subject.cfg.per_scene):
         save_field(folder / FIELD, views.field)

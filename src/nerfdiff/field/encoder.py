@@ -23,7 +23,7 @@ class Encoding:
     Args:
         source: the input images in [0, 1].
         features: W = e_ψ(I^s).
-        context: what the CDM attends to: the encoder's features after each attention block, or `NerfDiff.settled`.
+        context: what the CDM attends to: the encoder's features after each attention block, or `NerfDiff.with_keys_values`.
     """
 
     source: Float[Tensor, "batch 3 height width"]

@@ -111,7 +111,7 @@ class Consistency:
         fresh = self._fresh(source, *bounds, (self.seed, "consistency", scene_id))
         renderer = Renderer(self.uniform_samples, self.importance_samples, self.background, self.chunk)
         batches = RayBatches(cameras[fitted][None], *bounds)
-        batches.paint(dequantise(pixels[fitted])[None])
+        batches.set_colours(dequantise(pixels[fitted])[None])
         with torch.enable_grad():
             self._fit(fresh, renderer, batches, generator(device, self.seed, "consistency", scene_id, "rays"))
         with torch.no_grad():

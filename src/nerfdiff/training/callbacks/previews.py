@@ -9,7 +9,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.distill.cdm import IndependentViews
+from nerfdiff.distill.cdm import CDMSampling
 from nerfdiff.model import NerfDiff
 from nerfdiff.results.pictures import colour_depth, contact_sheet
 
@@ -23,7 +23,7 @@ class Previews(Callback):
         sampler: how the CDM's views are sampled.
     """
 
-    def __init__(self, folder: str, scenes: int, sampler: IndependentViews):
+    def __init__(self, folder: str, scenes: int, sampler: CDMSampling):
         self.folder = Path(folder)
         self.scenes = scenes
         self.sampler = sampler

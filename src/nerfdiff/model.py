@@ -60,17 +60,17 @@ class NerfDiff(nn.Module):
         near: Float[Tensor, "batch"],
         far: Float[Tensor, "batch"],
     ) -> Encoding:
-        """Input images in [0, 1] to triplanes (or a pixel-aligned NeRF's features) and what the CDM attends to."""
+        """Encode input images in [0, 1]: a field's features, and the features that the CDM attends to."""
         return self.encoder(source, cameras, near, far)
 
     def with_keys_values(self, encoding: Encoding) -> Encoding:
-        """The same encoding for many calls of the CDM: its features as the keys and values that attention makes of
-        them, which depend neither on the view nor on the diffusion step."""
+        """Replace the context by its keys and values, for many calls of the CDM: they depend neither on the view nor
+        on the diffusion step."""
         keys_values = self.denoiser.unet.keys_values(encoding.context) if self.denoiser.cross_attention else []
         return replace(encoding, context=keys_values)
 
     def field(self, encoding: Encoding) -> Field:
-        """The radiance field of each scene."""
+        """Return the radiance field of each scene."""
         make = TriplaneField if isinstance(encoding.features, Triplane) else PixelField.of
         return make(encoding.features, self.decoder)
 
@@ -87,7 +87,7 @@ class NerfDiff(nn.Module):
     def condition(
         self, encoding: Encoding, cameras: Cameras, rendered: Float[Tensor, "batch views 3 height width"]
     ) -> Condition:
-        """What the CDM sees of views [batch, views] rendered in [0, 1], flattened into one axis of batch · views."""
+        """Return the CDM's condition for views [batch, views] rendered in [0, 1], flattened into one axis."""
         views = cameras.shape[1]
         return Condition(
             rendered=rendered.flatten(0, 1),
@@ -98,7 +98,7 @@ class NerfDiff(nn.Module):
         )
 
     def parameter_count(self) -> dict[str, int]:
-        """Parameters of each part and in all."""
+        """Return the number of parameters of each part and in all."""
         parts = {
             part: sum(p.numel() for p in getattr(self, part).parameters())
             for part in ("encoder", "decoder", "denoiser")
@@ -107,6 +107,6 @@ class NerfDiff(nn.Module):
 
 
 def build_on_meta(config: Mapping) -> NerfDiff:
-    """The model on the meta device: shapes and counts without memory."""
+    """Build the model on the meta device: shapes and counts without memory."""
     with torch.device("meta"):
         return NerfDiff(**config)

@@ -24,7 +24,7 @@ from nerfdiff.distill.distillation import Distillation
 from nerfdiff.distill.module import NGDModule
 from nerfdiff.distill.priors import Sphere
 from nerfdiff.evaluation.distill import _warn_of_inert, distill
-from nerfdiff.evaluation.subject import dataset_subject, picture_subject
+from nerfdiff.evaluation.run import dataset_run, picture_run
 from nerfdiff.fit.saved_field import FIELD, load_field
 from nerfdiff.metrics.predictions import read_prediction
 from nerfdiff.metrics.score import Scorer
@@ -150,7 +150,7 @@ def test_what_cannot_act_on_a_picture_is_said(words, said, caplog):
 def test_the_field_in_the_file_is_the_one_whose_views_were_saved(precision, data, run, tmp_path):
     cfg = config(data, run, tmp_path, f"precision={precision}", "strategy.lr_decoder=1e-2")
     distill(cfg)
-    (scene,) = dataset_subject(cfg, torch.device("cpu")).load(["scene1"])
+    (scene,) = dataset_run(cfg, torch.device("cpu")).load(["scene1"])
     folder = scene_folder(tmp_path, "ngd", "scene1")
     saved = load_field(folder / FIELD)
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16-mixed"):
@@ -307,7 +307,7 @@ def test_equal_pictures_of_several_names_are_scenes_of_their_own(data, run, tmp_
     other = picture.with_name("a=b, c (1).png")
     shutil.copy(picture, other)
     configs = [config(data, run, tmp_path, f"image={path}") for path in (picture, other)]
-    first, second = (picture_subject(cfg, torch.device("cpu")) for cfg in configs)
+    first, second = (picture_run(cfg, torch.device("cpu")) for cfg in configs)
     assert (first.scene_ids, second.scene_ids) == (["red_car"], ["a_b_c_1"]) and first.folder != second.folder
 
 
@@ -357,10 +357,10 @@ def test_processes_that_cannot_be_had_are_refused(setting, data, run, tmp_path):
 def test_no_method_sees_the_truth(strategy, data, run, tmp_path):
     """Other target images, depths and masks: the same predictions, bit for bit."""
     cfg = config(data, run, tmp_path, f"strategy={strategy}")
-    subject = dataset_subject(cfg, torch.device("cpu"))
-    (scene,) = subject.load(["scene0"])
+    evaluation = dataset_run(cfg, torch.device("cpu"))
+    (scene,) = evaluation.load(["scene0"])
     other = dataclasses.replace(scene, target_pixels=255 - scene.target_pixels, target_depth=None, target_mask=None)
-    first, second = (instantiate(cfg.strategy).predict(subject.model, [batch], 0)[0] for batch in (scene, other))
+    first, second = (instantiate(cfg.strategy).predict(evaluation.model, [batch], 0)[0] for batch in (scene, other))
     assert torch.equal(first.images, second.images)
 
 

@@ -1,7 +1,7 @@
-"""Following the reverse process: DDIM, or DPM-Solver++(2M) in fewer steps, behind one interface.
+"""The reverse process: DDIM, or DPM-Solver++(2M) in fewer steps, behind one interface.
 
-A sampler only ever sees denoised images. Whoever calls it may change them before each step, which is how views are
-guided: the guided x̃0 goes in where x0 does.
+A sampler takes denoised images. Its caller may change them before each step, which is how views are guided: the guided
+x̃0 takes the place of x0.
 """
 
 import math
@@ -22,7 +22,7 @@ Images = Float[Tensor, "batch 3 height width"]
 
 
 def ddim_step(z: Images, x0: Images, t: Tensor, t_next: Tensor, eta: float, noise: Images | None) -> Images:
-    """One step from Z_t to Z_{t_next} given the denoised x0 (Song et al. 2020, DDIM, eq. 12 and 16).
+    """Step from Z_t to Z_{t_next} given the denoised x0 (DDIM, arXiv 2010.02502, eq. 12 and 16).
 
     Args:
         t, t_next: scalars, t > t_next.
@@ -41,13 +41,13 @@ def ddim_step(z: Images, x0: Images, t: Tensor, t_next: Tensor, eta: float, nois
 
 @runtime_checkable
 class Sampler(Protocol):
-    """One run of the reverse process; it may remember its earlier steps, so every run has its own."""
+    """A sampler of one run of the reverse process; it may keep earlier steps, so every run has its own."""
 
     needs_noise: bool
-    """Whether steps want fresh noise."""
+    """True if steps take fresh noise."""
 
     def step(self, z: Images, x0: Images, t: Tensor, t_next: Tensor, noise: Images | None) -> Images:
-        """From Z_t to Z_{t_next}.
+        """Step from Z_t to Z_{t_next}.
 
         Args:
             x0: the denoised images, guided or not.
@@ -57,7 +57,7 @@ class Sampler(Protocol):
 
 
 class DDIM:
-    """Song et al. 2020; first order in the step.
+    """Song et al. 2020, arXiv 2010.02502; first order in the step.
 
     Args:
         eta: 0 is deterministic, 1 is ancestral sampling.
@@ -96,7 +96,7 @@ class DPMSolverPP2M:
 
 
 def half_log_snr(t: Tensor) -> Tensor:
-    """λ = log(α/σ), from ∞ at t = 0 to −∞ at t = 1."""
+    """Return λ = log(α/σ), from ∞ at t = 0 to −∞ at t = 1."""
     alpha, sigma = alpha_sigma(t)
     return alpha.log() - sigma.log()
 
@@ -107,7 +107,7 @@ SPACINGS = ("uniform_t", "uniform_lambda")
 
 @dataclass(frozen=True)
 class SamplerSettings:
-    """How the reverse process is followed; `conf/common/sampler.yaml` has them.
+    """Settings of the reverse process; `conf/common/sampler.yaml` has them.
 
     Args:
         t_max, t_min: times where it starts and ends, in [0, 1].
@@ -134,7 +134,7 @@ class SamplerSettings:
 
 
 def make_sampler(name: str, eta: float) -> Sampler:
-    """A sampler for one run.
+    """Make a sampler for one run.
 
     Args:
         name: `ddim` or `dpmpp_2m`.
@@ -153,7 +153,7 @@ def make_sampler(name: str, eta: float) -> Sampler:
 
 
 def time_steps(n: int, t_max: float, t_min: float, spacing: str, device=None) -> Float[Tensor, "{n}+1"]:
-    """n + 1 times from t_max down to t_min.
+    """Return n + 1 times from t_max down to t_min.
 
     Args:
         spacing: `uniform_t`; or `uniform_lambda`, evenly over λ = log(α/σ), which suits DPM-Solver++ in few steps. λ is

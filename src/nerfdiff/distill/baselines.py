@@ -1,4 +1,4 @@
-"""Two honest baselines that know nothing of 3D: any method worth running beats both."""
+"""Two baselines without 3D: the input image and the mean image, as every view."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from nerfdiff.utils.randomness import generator
 
 @dataclass(frozen=True)
 class CopyInput:
-    """Every view looks like the input view."""
+    """Predict the input image for every view."""
 
     name: str = "copy_input"
 
@@ -30,7 +30,7 @@ class CopyInput:
 
 @dataclass(frozen=True)
 class MeanImage:
-    """Every view looks like the mean of the training images."""
+    """Predict the mean of the training images for every view."""
 
     mean: Float[Tensor, "3 height width"]
     name: str = "mean_image"
@@ -46,7 +46,7 @@ class MeanImage:
 
 
 def mean_training_image(reader: SceneReader, scenes: int, seed: int) -> Float[Tensor, "3 height width"]:
-    """Mean over all views of up to `scenes` training scenes, chosen by `seed`."""
+    """Return the mean over all views of up to `scenes` training scenes, chosen by `seed`."""
     order = torch.randperm(len(reader), generator=generator("cpu", seed, "mean image"))
     means = [reader.load(int(index)).images.mean(0) for index in order[:scenes]]
     return torch.stack(means).mean(0)

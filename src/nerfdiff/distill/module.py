@@ -24,10 +24,10 @@ SceneImages = Float[Tensor, "scenes views 3 height width"]
 
 
 class NGDModule(LightningModule):
-    """At every step: ask the teachers for images of all views, then fit the fields to them.
+    """Fit fields to their teachers' images of all views, step by step.
 
     The CDM and the encoder are no part of this module: what is saved, moved and counted is the fields. Scenes share
-    nothing but the device's time: each has its own views, teacher, noise, parameters, loss and end.
+    nothing but the device's time: each has its own views, teacher, noise, parameters, loss and status.
 
     Args:
         field: the single-image NeRFs to start from, of one or several scenes.
@@ -65,11 +65,11 @@ class NGDModule(LightningModule):
 
     @property
     def steps(self) -> int:
-        """How many times the teachers are asked."""
+        """Number of times the teachers are asked for targets."""
         return self.teachers[0].steps
 
     def train_dataloader(self) -> range:
-        """The teachers' steps."""
+        """Return the teachers' steps."""
         return range(self.steps)
 
     def configure_optimizers(self) -> tuple[list, list]:

@@ -1,4 +1,4 @@
-"""Stochastic conditioning of 3DiM (Watson et al. 2022, arXiv 2210.04628), on a CDM that is conditioned on renderings."""
+"""Stochastic conditioning (3DiM, Watson et al. 2022, arXiv 2210.04628), on a CDM conditioned on renderings."""
 
 from itertools import pairwise
 

@@ -1,4 +1,4 @@
-"""What a test-time method is: one input image and a trained model to images of other views."""
+"""Test-time methods: from one input image and a trained model to images of other views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from nerfdiff.utils.timing import timed
 
 @dataclass(frozen=True)
 class PredictedViews:
-    """Predicted images of one scene's target views, and what they cost to make.
+    """Predicted images of one scene's target views, and their cost.
 
     Args:
         images: colours in [0, 1].
@@ -30,7 +30,7 @@ class PredictedViews:
         denoiser_calls: images passed through the CDM.
         field_queries: points at which a field was evaluated.
         virtual_views: K, how many views a field was fitted to, where it was.
-        field: what the images are renderings of, where the method has a field.
+        field: the field that the images are rendered from, where the method has one.
         trace: of its fitting, where it was fitted.
         status: `ok`, or why the field is not the one that the method ended with.
     """
@@ -56,10 +56,10 @@ class PredictedViews:
         trace: Sequence[Step] = (),
         status: str = "ok",
     ) -> "PredictedViews":
-        """What a field shows to cameras [1, views].
+        """Render a field from cameras [1, views].
 
         Args:
-            denoiser_calls, field_queries: what it took to make the field; rendering is added here.
+            denoiser_calls, field_queries: spent on the field before; rendering is added here.
         """
         rendering = saved.field.render(saved.renderer, cameras)
         views = PredictedViews.of_rendering(rendering, saved.renderer, cameras)
@@ -74,7 +74,7 @@ class PredictedViews:
 
     @staticmethod
     def of_rendering(rendering: RenderedViews, renderer: Renderer, cameras: Cameras) -> "PredictedViews":
-        """What `renderer` made of a field that is not kept, of leading shape [1, views, height, width]."""
+        """Take the images, opacity and z-depth of a rendering of cameras [1, views]; no field is kept."""
         return PredictedViews(
             images=rendering.images[0],
             opacity=rendering.opacity[0],
@@ -92,7 +92,7 @@ class Strategy(Protocol):
     def predict(
         self, model: NerfDiff | None, scenes: Sequence[ViewBatch], seed: int, callbacks: Sequence[Callback] = ()
     ) -> list[PredictedViews]:
-        """Images of every target view of each of `scenes`, from its source view alone, whatever the other scenes.
+        """Predict every target view of each scene from its source view alone, independently of the other scenes.
 
         Args:
             model: frozen; baselines that use none take None.

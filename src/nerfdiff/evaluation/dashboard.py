@@ -63,10 +63,10 @@ class Dashboard:
         """
         home = Path(cfg.results).parent
         name, hparams = _name(row), _hparams(row, self.ignored)
-        told = {"status": row.status, "error": row.error, **hparams, **_metrics(row)}
+        facts = {"status": row.status, "error": row.error, **hparams, **_metrics(row)}
         settings = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
         texts = {
-            "about": f"{tensorboard.code(row.command or '')}\n\n{tensorboard.table(told)}",
+            "about": f"{tensorboard.code(row.command or '')}\n\n{tensorboard.table(facts)}",
             "config": tensorboard.code(OmegaConf.to_yaml(settings, resolve=HydraConfig.initialized()), "yaml"),
         }
         with _fresh(home / FOLDER / name) as writer:

@@ -1,4 +1,4 @@
-"""The image encoder e_ψ: one image to what a field is made of, and features for the CDM to attend to."""
+"""The image encoder e_ψ: from one image to a field's features, and features for the CDM to attend to."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ from nerfdiff.utils.images import to_signed
 
 @dataclass(frozen=True)
 class Encoding:
-    """What is known of a scene after one look: computed once per input image, whatever follows.
+    """Features of a scene, computed once per input image.
 
     Args:
         source: the input images in [0, 1].
         features: W = e_ψ(I^s).
-        context: what the CDM attends to: the encoder's features after each attention block, or `NerfDiff.with_keys_values`.
+        context: attended to by the CDM: the encoder's features after each attention block, or their keys and values.
     """
 
     source: Float[Tensor, "batch 3 height width"]
@@ -32,7 +32,7 @@ class Encoding:
 
     @property
     def triplane(self) -> Triplane:
-        """W of a field that can be fitted.
+        """The triplane W, the features of a field that can be fitted.
 
         Raises:
             ConfigError: W is no triplane.
@@ -71,7 +71,7 @@ class PixelEncoder(nn.Module):
 
     Args:
         backbone: from images to feature maps.
-        with_image: whether points find the colour of their pixel beside its features, as VisionNeRF's do.
+        with_image: give points the colour of their pixel beside its features, as VisionNeRF does.
     """
 
     def __init__(self, backbone: ResNetPyramid | VisionFeatures, with_image: bool):

@@ -1,4 +1,4 @@
-"""A radiance field: what the renderer calls at points."""
+"""Radiance fields: colour and density of points."""
 
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
@@ -16,7 +16,7 @@ from nerfdiff.field.triplane import Triplane
 
 @runtime_checkable
 class Field(Protocol):
-    """Colour and density of points seen along directions: all that the renderer asks of a radiance field."""
+    """A radiance field, as the renderer asks for it."""
 
     def __call__(
         self, points: Float[Tensor, "batch n 3"], directions: Float[Tensor, "batch n 3"]
@@ -47,18 +47,18 @@ class TriplaneField:
     def per_scene_unit(
         self, density: Float[Tensor, "batch n"], valid: Bool[Tensor, "batch n"]
     ) -> Float[Tensor, "batch n"]:
-        """The decoder's density, which is per unit of the frustum's depth; 0 where the features are not valid."""
+        """Convert the decoder's density per unit of the frustum's depth; 0 where the features are not valid."""
         return _per_scene_unit(density, valid, self.triplane)
 
 
 @dataclass(frozen=True)
 class PixelField:
-    """f_θ(x, d, W(P(x))) of a pixel-aligned NeRF, whose colour and density also depend on where one looks from.
+    """f_θ(x, d, W(P(x))) of a pixel-aligned NeRF, whose colour and density also depend on the viewing direction.
 
     Args:
-        features: W, or what the MLP's layers that take W alone have made of it.
+        features: W, or the outputs of the MLP's layers that take W alone.
         decoder: f_θ.
-        weights: of these layers, for each of the maps on which they are still to work; None where they have.
+        weights: of these layers, for each map that they are still to be applied to; None where they have been.
     """
 
     features: PixelFeatures
@@ -67,10 +67,10 @@ class PixelField:
 
     @staticmethod
     def of(features: PixelFeatures, decoder: ResidualMLP) -> "PixelField":
-        """A field that renders fast.
+        """Make a field that renders fast.
 
-        Interpolation is linear, as those layers are: they may as well come first. They do where that leaves no more
-        channels to gather at a point than there were; then they work on pixels, not on points.
+        Interpolation is linear, as those layers are, so they may come first. They do where that leaves no more channels
+        to gather at a point; then they are applied to pixels, not to points.
         """
         weight, _ = decoder.injection()
         maps, weights = [], []
@@ -89,7 +89,7 @@ class PixelField:
         parts = sampled.split([one.shape[1] for one in self.features.maps], -1)
         for part, weight in zip(parts, self.weights, strict=True):
             injected = injected + (part if weight is None else F.linear(part, weight))
-        rgb, density = self.decoder.given(self.features.centred(points), directions, injected)
+        rgb, density = self.decoder.from_injected(self.features.centred(points), directions, injected)
         return rgb, _per_scene_unit(density, valid, self.features)
 
 

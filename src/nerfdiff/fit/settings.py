@@ -1,4 +1,4 @@
-"""How a field is fitted to images of a scene at test time."""
+"""Settings of the fit of a field to images of a scene at test time."""
 
 import math
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ DECAYS = {
 """Factors of the learning rates, by the share of the teacher's steps that are done."""
 
 COARSE = ("every_step", "refresh")
-"""When coarse weights are computed anew."""
+"""Choices of when coarse weights are computed."""
 
 
 @dataclass(frozen=True)

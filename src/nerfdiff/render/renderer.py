@@ -26,17 +26,17 @@ CACHED_POINTS = 2**16
 """Points at once on a CPU, whatever `chunk` allows: more leave its caches, fewer cost more calls (measured)."""
 
 PARTS = ("origins", "directions", "near", "far", "jitter", "coarse")
-"""What belongs to rays, along their axis."""
+"""Arguments with one entry per ray."""
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """What rays saw. `*rays` is the leading shape of the rays.
+    """Rendered rays. `*rays` is their leading shape.
 
     Args:
         rgb: colour over the background.
         opacity: accumulated weight in [0, 1].
-        depth: expected distance along the ray given that something was hit; `far` where nothing was.
+        depth: expected distance along the ray given a hit, in scene units; `far` where there is none.
         coarse: weights of the uniform samples, each in the middle of one of so many equal bins, from which the others
             were drawn; in half precision, and only where they are to be kept.
     """
@@ -63,7 +63,9 @@ class RenderedViews:
 
 @dataclass(frozen=True)
 class Renderer:
-    """Uniform, then importance samples of one and the same field, composited together.
+    """Render a field by uniform, then importance samples of it, composited together (NeRF, arXiv 2003.08934).
+
+    Unlike NeRF's, both kinds are samples of the same field.
 
     Args:
         uniform_samples, importance_samples: per ray; the paper uses 64 and 64.
@@ -169,7 +171,7 @@ class Renderer:
             raise ValueError(f"coarse weights of shape {tuple(coarse.shape)}, expected {expected}")
 
     def _in_chunks(self, field, parts, keep_coarse, recompute):
-        """The values of a `Rendering`, of rays split along their second axis."""
+        """Render rays split along their second axis; return the values of a `Rendering`."""
         near = parts["near"]
         points = min(self.chunk, CACHED_POINTS) if near.device.type == "cpu" else self.chunk
         per_chunk = max(1, points // (len(near) * self.samples_per_ray))
@@ -212,7 +214,7 @@ class Renderer:
         return *self._composite(rays, distances, rgb, density), *kept
 
     def _composite(self, rays, distances, rgb, density):
-        """Colour, opacity and depth."""
+        """Integrate along rays: colour, opacity and depth."""
         lengths = edges_between(distances, rays.near, rays.far).diff(dim=-1)
         weights = compositing_weights(density, lengths)
         if self.background is None:
@@ -234,12 +236,12 @@ class Renderer:
 
 
 def _split(parts: dict[str, Tensor], size: int, axis: int) -> Iterator[dict[str, Tensor]]:
-    """All parts, so many entries of an axis at a time."""
+    """Split all parts along an axis, so many entries at a time."""
     for values in zip(*(part.split(size, axis) for part in parts.values()), strict=True):
         yield dict(zip(parts, values, strict=True))
 
 
 def _joined(outputs: Sequence[Sequence[Tensor]], axis: int) -> list[Tensor]:
-    """Value by value, what parts of the rays gave."""
+    """Join the values of parts of the rays."""
     with full_precision(outputs[0][0].device):  # autocast on a CPU cannot join halves
         return [torch.cat(values, axis) for values in zip(*outputs, strict=True)]

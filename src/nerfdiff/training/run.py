@@ -129,7 +129,7 @@ def _begin(module: NerfDiffModule, cfg: DictConfig, model_config: dict) -> None:
 
 
 def _kept_renderings(cfg: DictConfig, data: SceneDataModule) -> str | None:
-    """The folder for a frozen field's renderings: its name says how which data are rendered."""
+    """Return the folder for a frozen field's renderings, named by the data and the renderer."""
     if not cfg.kept_renderings:
         return None
     if data.source_target_noise:
@@ -153,7 +153,7 @@ def _within_memory(model_config: dict, trainer: Trainer, data: SceneDataModule) 
 
 
 def build_trainer(cfg: DictConfig) -> Trainer:
-    """The Lightning Trainer of a composed training config."""
+    """Build the Lightning Trainer of a composed training config."""
     options: dict[str, Any] = {}
     if cfg.trainer.precision == "auto":
         options["precision"] = auto_precision(cfg.trainer.accelerator)
@@ -207,7 +207,7 @@ def _checkpoint_to_resume(output_dir: Path, cfg: DictConfig, model_config: dict,
 
 
 def _sound(output_dir: Path) -> str:
-    """What is left of a run that diverged."""
+    """Say which checkpoint of a run that diverged is sound."""
     last = last_checkpoint(output_dir)
     if not last.is_file():
         return "No checkpoint is from before that: start afresh"

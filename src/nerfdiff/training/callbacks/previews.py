@@ -15,7 +15,7 @@ from nerfdiff.results.pictures import colour_depth, contact_sheet
 
 
 class Previews(Callback):
-    """At each validation writes one sheet, a row per held-out view, as PNG and to TensorBoard.
+    """Write one sheet at each validation, a row per held-out view, as PNG and to TensorBoard.
 
     Args:
         folder: of the PNGs, named by step.

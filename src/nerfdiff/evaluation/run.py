@@ -1,4 +1,4 @@
-"""What is evaluated on what: a model, scenes, and all that predictions of one run share."""
+"""An evaluation run: a model, scenes, settings, and all that predictions of one run share."""
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -29,22 +29,80 @@ SAMPLES = ("uniform_samples", "importance_samples")
 
 
 @dataclass(frozen=True)
-class Subject:
+class Orbit:
+    """Settings of the videos of a circle around the object; `scenes` are shown side by side in evaluate.py's."""
+
+    frames: int
+    fps: int
+    scenes: int = 1
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """Settings of the contact sheet."""
+
+    scenes: int
+    views: int
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Settings that evaluate.py and distill.py share (`conf/common/evaluation.yaml` says more of each).
+
+    Args:
+        dataset: name and split.
+        results: file to which a row per strategy is appended.
+        scoring: settings of the metrics, as plain data.
+        compiled: whether the U-Nets are.
+        minutes: after which no scene begins.
+        progress_every: seconds between lines where there is no terminal.
+        per_scene: leave every scene's field, trace and orbit beside its views.
+    """
+
+    run_name: str
+    dataset: str
+    seed: int
+    results: Path
+    scoring: Mapping[str, Any]
+    compiled: bool
+    scenes_at_once: int
+    minutes: float | None
+    progress_every: float | None
+    per_scene: bool
+    orbit: Orbit
+    sheet: Sheet
+
+    @staticmethod
+    def of(cfg: DictConfig) -> "RunSettings":
+        """Read the settings of a composed config."""
+        same = ("run_name", "seed", "scenes_at_once", "minutes", "progress_every", "per_scene")
+        return RunSettings(
+            **{name: cfg[name] for name in same},
+            dataset=f"{cfg.data.name}/{cfg.data.test_split}",
+            results=Path(cfg.results),
+            scoring=plain(cfg.metrics),
+            compiled=cfg.compile != "none",
+            orbit=Orbit(**plain(cfg.orbit)),
+            sheet=Sheet(**plain(cfg.sheet)),
+        )
+
+
+@dataclass(frozen=True)
+class EvaluationRun:
     """A model and scenes, on a device.
 
     Args:
-        cfg: of evaluate.py or distill.py.
-        load: batches of one scene each, of these ids.
-        identity: what makes predictions comparable; other settings of it, other predictions.
-        folder: of all that the run leaves.
+        load: reads the scenes of these ids, in batches of one.
+        identity: all settings that predictions depend on.
+        folder: holds all files of the run.
         stability: of the model's training, see `LoadedModel`.
-        conditions: a digest of what changes what scenes cost, and their numbers by rounding at most: hardware, threads,
-            scenes at once, the renderer's chunks and the memory layout.
+        cost_key: a digest of settings that change the costs of scenes, and their numbers by rounding at most: hardware,
+            threads, scenes at once, the renderer's chunks and the memory layout.
         rows_before: bytes of the file of results before this run.
         data: where the scenes come from; None for a picture, whose other views nobody knows.
     """
 
-    cfg: DictConfig
+    settings: RunSettings
     model: NerfDiff
     load: Callable[[Sequence[str]], Iterable[ViewBatch]]
     scene_ids: list[str]
@@ -53,7 +111,7 @@ class Subject:
     identity: dict[str, Any]
     folder: Path
     stability: Mapping[str, float | int | None]
-    conditions: str
+    cost_key: str
     rows_before: int
     data: SceneDataModule | None
 
@@ -62,7 +120,7 @@ class Subject:
         return self.folder / "predictions"
 
     def autocast(self) -> AbstractContextManager:
-        """bf16 products where the precision asks for them."""
+        """Compute products in bf16 where the precision asks for it."""
         if self.precision == "32-true":
             return nullcontext()
         # Without the cache: it would keep the first bf16 copy of parameters that a strategy fits.
@@ -70,7 +128,7 @@ class Subject:
 
 
 def choose_device(name: str) -> torch.device:
-    """A device by its name, or by what there is.
+    """Return a device by its name; `auto` is the first GPU, or the CPU where there is none.
 
     Raises:
         ConfigError: it cannot be used here.
@@ -99,8 +157,8 @@ def _load(cfg: DictConfig) -> LoadedModel:
     return loaded
 
 
-def dataset_subject(cfg: DictConfig, device: torch.device) -> Subject:
-    """The test scenes of `cfg.data`.
+def dataset_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
+    """Prepare the test scenes of `cfg.data`.
 
     Raises:
         UserError: bad data, config or checkpoint.
@@ -128,13 +186,13 @@ def dataset_subject(cfg: DictConfig, device: torch.device) -> Subject:
         "reader": reader.identity,
         "views": [cfg.data.source_view, cfg.data.eval_stride],
         "image_size": size,
-        "mean_image_scenes": cfg.get("mean_image_scenes"),  # of a baseline that only evaluate.py has
+        "mean_image_scenes": cfg.get("mean_image_scenes"),  # a baseline of evaluate.py
     }
-    return _subject(cfg, device, loaded, load, scene_ids, facts, datamodule)
+    return _run(cfg, device, loaded, load, scene_ids, facts, datamodule)
 
 
-def picture_subject(cfg: DictConfig, device: torch.device) -> Subject:
-    """The scene on the picture `cfg.image`, to be seen from `cfg.picture_views`.
+def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
+    """Prepare the scene of the picture `cfg.image`, to be rendered from `cfg.picture_views`.
 
     Raises:
         UserError: bad picture, config or checkpoint.
@@ -156,10 +214,10 @@ def picture_subject(cfg: DictConfig, device: torch.device) -> Subject:
         "picture_views": plain(cfg.picture_views),
         "image_size": list(size),
     }
-    return _subject(cfg, device, loaded, lambda names: [scene] * len(names), list(scene.scene_ids), facts, None)
+    return _run(cfg, device, loaded, lambda names: [scene] * len(names), list(scene.scene_ids), facts, None)
 
 
-def _subject(
+def _run(
     cfg: DictConfig,
     device: torch.device,
     loaded: LoadedModel,
@@ -167,7 +225,7 @@ def _subject(
     scene_ids: list[str],
     facts: dict[str, Any],
     data: SceneDataModule | None,
-) -> Subject:
+) -> EvaluationRun:
     precision = cfg.precision if cfg.precision != "auto" else auto_precision(device.type)
     if precision not in PRECISIONS:
         raise ConfigError(f"precision must be auto, {' or '.join(PRECISIONS)}, got {precision!r}")
@@ -191,10 +249,9 @@ def _subject(
         model.to(memory_format=torch.channels_last)
     compile_unets(model, cfg.compile, cfg.paths.compiled_dir)
     spent_on = [hardware(device), cfg.threads, cfg.scenes_at_once, model.renderer.chunk, in_pixels]
-    conditions = sha256_values(spent_on)[:8]
-    results = Path(cfg.results)
-    return Subject(
-        cfg=cfg,
+    settings = RunSettings.of(cfg)
+    return EvaluationRun(
+        settings=settings,
         model=model,
         load=load,
         scene_ids=scene_ids,
@@ -203,7 +260,7 @@ def _subject(
         identity=identity,
         folder=folder,
         stability=loaded.stability,
-        conditions=conditions,
-        rows_before=results.stat().st_size if results.is_file() else 0,
+        cost_key=sha256_values(spent_on)[:8],
+        rows_before=settings.results.stat().st_size if settings.results.is_file() else 0,
         data=data,
     )

@@ -3,6 +3,7 @@ import torch
 
 from model_fixtures import input_cameras, model
 from nerfdiff.cli import load_config
+from nerfdiff.data.batch import ViewBatch
 from nerfdiff.model import build_on_meta
 from nerfdiff.utils.config import plain
 
@@ -54,3 +55,13 @@ def test_scenes_of_a_batch_do_not_mix():
         one = slice(i, i + 1)
         alone = net.encode_images(source[one], cameras[one], near[one], far[one])
         torch.testing.assert_close(net.render(alone, cameras[one, None]).images, together[one], atol=1e-5, rtol=0)
+
+
+def test_a_batch_is_encoded_by_its_source_views():
+    net, cameras, near, far = model(), input_cameras(2), torch.full((2,), 0.8), torch.full((2,), 1.8)
+    pixels = torch.randint(0, 256, (2, 3, 16, 16), dtype=torch.uint8)
+    names = ("a", "b")
+    views = cameras, pixels[:, None], cameras[:, None]
+    batch = ViewBatch(torch.arange(2), pixels, *views, near, far, names, names, (names, names))
+    expected = net.encode_images(pixels.float() / 255, cameras, near, far)
+    assert torch.equal(net.encode(batch).triplane.planes, expected.triplane.planes)

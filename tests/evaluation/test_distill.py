@@ -23,7 +23,7 @@ from nerfdiff.cli import load_config
 from nerfdiff.distill.distillation import Distillation
 from nerfdiff.distill.module import NGDModule
 from nerfdiff.distill.priors import Sphere
-from nerfdiff.evaluation.distill import _warn_of_inert, distill
+from nerfdiff.evaluation.distill import _warn_of_unused, distill
 from nerfdiff.evaluation.run import dataset_run, picture_run
 from nerfdiff.fit.saved_field import FIELD, load_field
 from nerfdiff.metrics.predictions import read_prediction
@@ -142,7 +142,7 @@ def test_scenes_with_different_numbers_of_views_are_told(data, run, tmp_path, mo
     ],
 )
 def test_what_cannot_act_on_a_picture_is_said(words, said, caplog):
-    _warn_of_inert(words)
+    _warn_of_unused(words)
     assert caplog.text == "" if said is None else said in caplog.text
 
 

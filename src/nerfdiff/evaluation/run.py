@@ -82,8 +82,8 @@ class RunSettings:
             results=Path(cfg.results),
             scoring=plain(cfg.metrics),
             compiled=cfg.compile != "none",
-            orbit=Orbit(**plain(cfg.orbit)),
-            sheet=Sheet(**plain(cfg.sheet)),
+            orbit=instantiate(cfg.orbit),
+            sheet=instantiate(cfg.sheet),
         )
 
 

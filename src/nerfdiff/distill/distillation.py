@@ -72,7 +72,7 @@ class Distillation:
         """
         if len({scene.source.shape for scene in scenes}) > 1:
             raise ConfigError("scenes whose images differ in size cannot be distilled together: set scenes_at_once=1")
-        # encode, one by one, so that a scene's numbers do not depend on its company
+        # encode, one by one, so that a scene's numbers do not depend on the others
         seeds = [(seed, "distil", *scene.scene_ids) for scene in scenes]
         with torch.no_grad():
             encodings = [model.encode(scene) for scene in scenes]
@@ -82,14 +82,9 @@ class Distillation:
             VirtualViews(model, encoding, self.prior(scene), self.views_at_once, own)
             for encoding, scene, own in zip(encodings, scenes, seeds, strict=True)
         ]
-        module = NGDModule(
-            RefinedField(triplane, model.decoder),
-            views,
-            [self.teacher(v) for v in views],
-            self.fit,
-            seeds,
-        )
-        # let the teachers guide the fit
+        # fit the field to the teachers' images
+        teachers = [self.teacher(v) for v in views]
+        module = NGDModule(RefinedField(triplane, model.decoder), views, teachers, self.fit, seeds)
         device = scenes[0].source.device
         with torch.enable_grad(), _quiet("lightning.pytorch"):
             trainer = Trainer(

@@ -13,7 +13,7 @@ from nerfdiff.utils.errors import ConfigError
 
 
 class Reassembled(nn.Module):
-    """Tokens of one depth as a feature map (Ranftl et al. 2021): the class token read out into all, then resized.
+    """Tokens of one depth as a feature map (DPT, arXiv 2103.13413): the class token read out into all, then resized.
 
     Args:
         width: of the tokens.

@@ -1,4 +1,4 @@
-"""The vision transformer of VisionNeRF (Dosovitskiy et al. 2021, as used by Lin et al. 2023)."""
+"""The vision transformer of VisionNeRF (ViT, arXiv 2010.11929, as in arXiv 2207.05736)."""
 
 from collections.abc import Sequence
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 
 from harness import RESULTS
-from nerfdiff.evaluation.subject import choose_device
+from nerfdiff.evaluation.run import choose_device
 
 SHARES = {"render": 1.0, "inner_step": 1.0, "unet": 2.0, "training_step": 3.0, "ngd_object": 3.0, "field_speed": 2.0}
 SWEEPS = {

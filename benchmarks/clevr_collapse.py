@@ -74,9 +74,9 @@ def one_scene(reader: SceneReader, index: int, source: int) -> ViewBatch:
 @torch.no_grad()
 def measured(model: NerfDiff, batch: ViewBatch) -> tuple[torch.Tensor, torch.Tensor, list[float]]:
     """Renders [views, 3, h, w], the input view's z-depth [1, h, w], and the row of the table."""
-    encoding = model.encode(batch.source, batch.source_cameras, batch.near, batch.far)
+    encoding = model.encode(batch)
     rendering = model.render(encoding, batch.target_cameras)
-    images = rendering.rgb[0].movedim(-1, 1)
+    images = rendering.images[0]
     quality = psnr(images, batch.targets[0])
     depth, truth = z_depth(rendering.depth, batch.target_cameras)[0, 0], batch.target_depth[0, 0]
     hit = (truth > 0) & (truth < float(batch.far))

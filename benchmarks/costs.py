@@ -91,7 +91,7 @@ class Traffic(TorchDispatchMode):
 def _encoded(model: NerfDiff, size: int, batch: int):
     with torch.device("meta"):
         cameras = Cameras(torch.empty(batch, 4, 4), torch.empty(batch, 3, 3), size, size)
-        return model.encode(torch.empty(batch, 3, size, size), cameras, torch.empty(batch), torch.empty(batch))
+        return model.encode_images(torch.empty(batch, 3, size, size), cameras, torch.empty(batch), torch.empty(batch))
 
 
 def _denoise(model: NerfDiff, size: int, batch: int, views: int) -> Callable[[], Any]:

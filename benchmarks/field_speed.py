@@ -131,7 +131,7 @@ def _views(measured: Subject) -> ViewBatch:
 
 def _encode(measured: Subject) -> Encoding:
     views = _views(measured)
-    return measured.model.encode(views.source, views.source_cameras, views.near, views.far)
+    return measured.model.encode(views)
 
 
 def _rays(measured: Subject, count: int | None) -> Rays:

@@ -82,10 +82,10 @@ def steps_of(
     field = noise_field(measured, setting["plane"], setting["scenes"])
     views = scene(measured, setting["views"], setting["scenes"])
     batches = RayBatches(views.target_cameras, field.near, field.far)
-    batches.paint(views.targets)
+    batches.set_colours(views.targets)
     if keep:
         with torch.no_grad(), measured.autocast():
-            batches.remember(field.render(renderer, views.target_cameras, keep_coarse=True).coarse)
+            batches.set_coarse(field.render(renderer, views.target_cameras, keep_coarse=True).coarse)
     rates = torch.tensor([5e-2, 1e-4], device=measured.device)
     optimizer = torch.optim.Adam(
         [{"params": [field.planes], "lr": rates[0]}, {"params": list(field.decoder.parameters()), "lr": rates[1]}],

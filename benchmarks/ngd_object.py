@@ -201,7 +201,8 @@ def _ways(arguments: argparse.Namespace, measured: Subject, views: int) -> dict[
 
 
 def _distils(measured: Subject, way: Way, steps: int, scenes: Sequence[ViewBatch]):
-    own = replace(way.plan.method(steps), cuda_graphs=way.cuda_graphs)
+    method = way.plan.method(steps)
+    own = replace(method, fit=replace(method.fit, cuda_graphs=way.cuda_graphs))
 
     def call():
         with measured.autocast():
@@ -257,7 +258,7 @@ def _pieces(measured: Subject, way: Way, one: ViewBatch, setting: dict[str, int]
 
     def encode():
         with torch.no_grad(), measured.autocast():
-            return model.encode(one.source, one.source_cameras, one.near, one.far)
+            return model.encode(one)
 
     encoding = encode()
 

@@ -16,7 +16,7 @@ from nerfdiff.checkpoint import load_model
 from nerfdiff.cli import CONF, load_config
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.priors import Prior
-from nerfdiff.evaluation.subject import choose_device
+from nerfdiff.evaluation.run import choose_device
 from nerfdiff.model import NerfDiff
 from nerfdiff.utils.config import auto_precision, plain
 

@@ -12,6 +12,7 @@ import torch
 
 import costs
 from harness import Row, Variant, interleaved, parser, settings_of
+from nerfdiff.utils.images import to_signed
 from report import Report
 from subjects import Subject, scene, subject
 from variants import models
@@ -36,7 +37,7 @@ def main(words: list[str] | None = None) -> str:
 @torch.no_grad()
 def _encoder(measured: Subject, compiled: bool, seconds: float) -> list[Row]:
     one = scene(measured, 1)
-    inputs = 2 * one.source - 1
+    inputs = to_signed(one.source)
 
     def encode(unet) -> Variant:
         @torch.no_grad()
@@ -61,8 +62,8 @@ def _encoder(measured: Subject, compiled: bool, seconds: float) -> list[Row]:
 def _denoiser(measured: Subject, views: int, compiled: bool, seconds: float) -> list[Row]:
     model, one = measured.model, scene(measured, views)
     with measured.autocast():
-        encoding = model.encode(one.source, one.source_cameras, one.near, one.far)
-        settled = model.settled(encoding)
+        encoding = model.encode(one)
+        settled = model.with_keys_values(encoding)
     shown = torch.rand(1, views, 3, measured.size, measured.size, device=measured.device)
     condition = model.condition(encoding, one.target_cameras, shown)
     z = torch.randn(views, 3, measured.size, measured.size, device=measured.device)

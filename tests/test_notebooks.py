@@ -44,7 +44,7 @@ def test_from_picture_to_field(tmp_path):
     torch.testing.assert_close(saved.field.cameras.K, source.cameras.K, rtol=1e-3, atol=0)
     own = Cameras(torch.eye(4)[None, None], source.cameras.K[None], 32, 32)
     with torch.no_grad():
-        rendered = saved.field.render(saved.renderer, own).rgb[0].movedim(-1, 1)
+        rendered = saved.field.render(saved.renderer, own).images[0]
     assert psnr(rendered, source.images).item() > empty + 6
     shown = sum("image/png" in output.get("data", {}) for output in outputs)
     assert shown == len(list((tmp_path / "out").glob("*.png"))) == 7

@@ -73,8 +73,8 @@ def test_a_ray_is_the_mlp_along_its_own_direction(name):
     made = net(name)
     made.renderer = type(made.renderer)(uniform_samples=12, importance_samples=0, background=1.0, chunk=10**6)
     cameras = other_cameras(1)
-    encoding = made.encode(torch.rand(1, 3, 16, 16), input_cameras(1), *bounds(1))
-    image = made.render(encoding, cameras).rgb
+    encoding = made.encode_images(torch.rand(1, 3, 16, 16), input_cameras(1), *bounds(1))
+    image = made.render(encoding, cameras).images
     found, decoder = encoding.features, copy.deepcopy(made.decoder).double()
     rays = cameras.rays(*(b[:, None] for b in bounds(1)))
     for view, row, column in [(0, 3, 8), (1, 12, 5)]:
@@ -87,7 +87,7 @@ def test_a_ray_is_the_mlp_along_its_own_direction(name):
             rgb, density = decoder(centred, direction, features[0, 0].double())
             alpha = 1 - np.exp(-float(density) / 12) if valid else 0.0  # FAR - NEAR is 1
             colour, left = colour + left * alpha * rgb.numpy(), left * (1 - alpha)
-        np.testing.assert_allclose(image[0, view, row, column].numpy(), colour + left, atol=2e-5)
+        np.testing.assert_allclose(image[0, view, :, row, column].numpy(), colour + left, atol=2e-5)
     field, x = PixelField.of(found, made.decoder), torch.tensor([[[0.1, 0.0, 1.2]]])
     ahead = torch.tensor([[[0.0, 0.0, 1.0]]])
     assert not torch.allclose(field(x, ahead)[0], field(x, -ahead)[0])
@@ -97,23 +97,23 @@ def test_a_ray_is_the_mlp_along_its_own_direction(name):
 def test_scenes_of_a_batch_do_not_mix_and_images_need_not_be_square(name):
     made, cameras, source = net(name), input_cameras(3, 12, 20), torch.rand(3, 3, 12, 20)
     views = other_cameras(3, 12, 20)
-    together = made.render(made.encode(source, cameras, *bounds(3)), views).rgb
-    assert together.shape == (3, 2, 12, 20, 3)
+    together = made.render(made.encode_images(source, cameras, *bounds(3)), views).images
+    assert together.shape == (3, 2, 3, 12, 20)
     for i in range(3):
         one = slice(i, i + 1)
-        alone = made.encode(source[one], cameras[one], *bounds(1))
-        torch.testing.assert_close(made.render(alone, views[one]).rgb, together[one], atol=1e-5, rtol=0)
+        alone = made.encode_images(source[one], cameras[one], *bounds(1))
+        torch.testing.assert_close(made.render(alone, views[one]).images, together[one], atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("name", ENCODERS)
 def test_both_losses_reach_the_image_encoder(name):
     made = net(name)
-    encoding = made.encode(torch.rand(2, 3, 16, 16), input_cameras(2), *bounds(2))
+    encoding = made.encode_images(torch.rand(2, 3, 16, 16), input_cameras(2), *bounds(2))
     views = other_cameras(2)
     rendering = made.render(encoding, views)
-    condition = made.condition(encoding, views, rendering.rgb.movedim(-1, 2))
+    condition = made.condition(encoding, views, rendering.images)
     velocity = made.denoiser.velocity(torch.randn(4, 3, 16, 16), torch.full((4,), 0.5), condition)
-    for loss in (rendering.rgb.square().sum(), velocity.square().sum()):
+    for loss in (rendering.images.square().sum(), velocity.square().sum()):
         made.zero_grad()
         loss.backward(retain_graph=True)
         assert all(p.grad is not None and p.grad.any() for p in made.encoder.parameters())
@@ -127,7 +127,7 @@ def test_recomputing_chunks_changes_nothing(name):
         made.renderer = type(made.renderer)(uniform_samples=6, importance_samples=6, background=1.0, chunk=chunk)
         made.zero_grad()
         source = torch.rand(1, 3, 16, 16, generator=torch.Generator().manual_seed(0))
-        made.render(made.encode(source, input_cameras(1), *bounds(1)), views).rgb.square().sum().backward()
+        made.render(made.encode_images(source, input_cameras(1), *bounds(1)), views).images.square().sum().backward()
         gradients.append([p.grad for part in (made.encoder, made.decoder) for p in part.parameters()])
     for whole, parts in zip(*gradients, strict=True):
         torch.testing.assert_close(parts, whole, atol=1e-3, rtol=1e-3)

@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -65,15 +66,19 @@ class LoadedModel:
         return f"{self.path}{size}: trained on {', then '.join(phases) or 'what was not recorded'}"
 
 
-def load_model(ckpt: str | Path, weights: str, assets: str | Path | None = None) -> LoadedModel:
+def load_model(
+    ckpt: str | Path, weights: str, assets: str | Path | None = None, renderer: Mapping = MappingProxyType({})
+) -> LoadedModel:
     """Read a model with the sizes it was trained with.
 
     Args:
         ckpt, assets: see `find_weights`.
         weights: `ema`, the average that the paper evaluates, or `raw`.
+        renderer: settings of the `Renderer` that replace those of the training.
 
     Raises:
         CheckpointError: no such file, not a checkpoint of this project, or it lacks these weights.
+        ConfigError: settings that a `Renderer` cannot have.
     """
     if weights not in ("ema", "raw"):
         raise CheckpointError(f"weights must be ema or raw, got {weights!r}")
@@ -83,7 +88,7 @@ def load_model(ckpt: str | Path, weights: str, assets: str | Path | None = None)
     read = _read_export if path.suffix == ".safetensors" else _read_ckpt
     config, state, about = read(path, weights)
     recorded = about.get("image_size"), about.get("stability") or {}, about.get("trained_on") or ()
-    return LoadedModel(_build(config, state, path), path, weights, config, *recorded)
+    return LoadedModel(_build(config, renderer, state, path), path, weights, config, *recorded)
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -346,7 +351,7 @@ def _digest(weights: Path, settings: Mapping) -> str:
     return sha256_values([sha256_file(weights), settings])
 
 
-def _build(config: Mapping, state: dict[str, torch.Tensor], path: Path) -> NerfDiff:
+def _build(config: Mapping, renderer: Mapping, state: dict[str, torch.Tensor], path: Path) -> NerfDiff:
     try:
         expected = {name: value.shape for name, value in build_on_meta(config).state_dict().items()}
         found = {name: value.shape for name, value in state.items()}
@@ -354,11 +359,12 @@ def _build(config: Mapping, state: dict[str, torch.Tensor], path: Path) -> NerfD
             raise ValueError(
                 f"{len(wrong)} weights, as {wrong[0]}: {found.get(wrong[0])}, expected {expected.get(wrong[0])}"
             )
-        model = NerfDiff(**config)
-        model.load_state_dict({name: value.float() for name, value in state.items()})
+        weights = {name: value.float() for name, value in state.items()}
     except Exception as error:  # settings of any kind surface as whatever a module trips over
         reason = " ".join(str(error).split())[:300]
         raise CheckpointError(f"{path} does not fit its own settings: {reason}") from error
+    model = NerfDiff(**config | {"render": {**config["render"], **renderer}})
+    model.load_state_dict(weights)
     return model.eval()
 
 

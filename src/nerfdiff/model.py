@@ -8,12 +8,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfdiff.cameras import Cameras
+from nerfdiff.data.batch import ViewBatch
 from nerfdiff.diffusion.denoiser import Condition, Denoiser
 from nerfdiff.field.encoder import Encoding
-from nerfdiff.field.field import PixelField, TriplaneField
+from nerfdiff.field.field import Field, PixelField, TriplaneField
 from nerfdiff.field.kinds import TRIPLANE, encoder_and_decoder
 from nerfdiff.field.triplane import Triplane
-from nerfdiff.render.renderer import Renderer, Rendering
+from nerfdiff.render.renderer import RenderedViews, Renderer
 from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.timing import timed
 
@@ -47,25 +48,29 @@ class NerfDiff(nn.Module):
         self.renderer = Renderer(**render)
         self.denoiser = Denoiser(**conditioning, unet=unet)
 
+    def encode(self, batch: ViewBatch) -> Encoding:
+        """Encode a batch's source views, see `encode_images`."""
+        return self.encode_images(batch.source, batch.source_cameras, batch.near, batch.far)
+
     @timed("encode")
-    def encode(
+    def encode_images(
         self,
         source: Float[Tensor, "batch 3 height width"],
         cameras: Cameras,
         near: Float[Tensor, "batch"],
         far: Float[Tensor, "batch"],
     ) -> Encoding:
-        """Input images in [0, 1] to triplanes (or a pixel-aligned NeRF's features) and what the CDM attends to."""
+        """Encode input images in [0, 1]: a field's features, and the features that the CDM attends to."""
         return self.encoder(source, cameras, near, far)
 
-    def settled(self, encoding: Encoding) -> Encoding:
-        """The same encoding for many calls of the CDM: its features as the keys and values that attention makes of
-        them, which depend neither on the view nor on the diffusion step."""
+    def with_keys_values(self, encoding: Encoding) -> Encoding:
+        """Replace the context by its keys and values, for many calls of the CDM: they depend neither on the view nor
+        on the diffusion step."""
         keys_values = self.denoiser.unet.keys_values(encoding.context) if self.denoiser.cross_attention else []
         return replace(encoding, context=keys_values)
 
-    def field(self, encoding: Encoding) -> TriplaneField | PixelField:
-        """The radiance field of each scene."""
+    def field(self, encoding: Encoding) -> Field:
+        """Return the radiance field of each scene."""
         make = TriplaneField if isinstance(encoding.features, Triplane) else PixelField.of
         return make(encoding.features, self.decoder)
 
@@ -74,15 +79,15 @@ class NerfDiff(nn.Module):
         encoding: Encoding,
         cameras: Cameras,
         jitter: Float[Tensor, "batch n samples"] | None = None,
-    ) -> Rendering:
-        """Render views [batch, views] given in the input cameras' space: leading shape [batch, views, h, w]."""
+    ) -> RenderedViews:
+        """Render views [batch, views] given in the input cameras' space."""
         frustum = encoding.features
         return self.renderer.render_views(self.field(encoding), cameras, frustum.near, frustum.far, jitter)
 
     def condition(
         self, encoding: Encoding, cameras: Cameras, rendered: Float[Tensor, "batch views 3 height width"]
     ) -> Condition:
-        """What the CDM sees of views [batch, views] rendered in [0, 1], flattened into one axis of batch · views."""
+        """Return the CDM's condition for views [batch, views] rendered in [0, 1], flattened into one axis."""
         views = cameras.shape[1]
         return Condition(
             rendered=rendered.flatten(0, 1),
@@ -93,7 +98,7 @@ class NerfDiff(nn.Module):
         )
 
     def parameter_count(self) -> dict[str, int]:
-        """Parameters of each part and in all."""
+        """Return the number of parameters of each part and in all."""
         parts = {
             part: sum(p.numel() for p in getattr(self, part).parameters())
             for part in ("encoder", "decoder", "denoiser")
@@ -102,6 +107,6 @@ class NerfDiff(nn.Module):
 
 
 def build_on_meta(config: Mapping) -> NerfDiff:
-    """The model on the meta device: shapes and counts without memory."""
+    """Build the model on the meta device: shapes and counts without memory."""
     with torch.device("meta"):
         return NerfDiff(**config)

@@ -32,8 +32,8 @@ def views() -> Cameras:
 
 def condition_of(net, source):
     bounds = torch.tensor([0.8]), torch.tensor([1.8])
-    encoding = net.encode(source, input_cameras(1), *bounds)
-    return net.condition(encoding, views(), net.render(encoding, views()).rgb.movedim(-1, 2))
+    encoding = net.encode_images(source, input_cameras(1), *bounds)
+    return net.condition(encoding, views(), net.render(encoding, views()).images)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -80,12 +80,12 @@ def test_a_settled_encoding_conditions_as_the_encoding_itself(variant):
     net = build(variant)
     source, near, far = torch.rand(2, 3, 16, 16), torch.full((2,), 0.8), torch.full((2,), 1.8)
     with torch.no_grad():
-        encoding = net.encode(source, input_cameras(2), near, far)
+        encoding = net.encode_images(source, input_cameras(2), near, far)
         wanted = Cameras(views().c2w.expand(2, 2, 4, 4), views().K.expand(2, 2, 3, 3), 16, 16)
         rendering, z = net.render(encoding, wanted), torch.randn(4, 3, 16, 16)
         plain, settled = (
-            net.denoiser(z, torch.full((4,), 0.5), net.condition(known, wanted, rendering.rgb.movedim(-1, 2)))
-            for known in (encoding, net.settled(encoding))
+            net.denoiser(z, torch.full((4,), 0.5), net.condition(known, wanted, rendering.images))
+            for known in (encoding, net.with_keys_values(encoding))
         )
     torch.testing.assert_close(settled, plain, atol=1e-4, rtol=1e-4)
 

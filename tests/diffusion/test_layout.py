@@ -4,7 +4,7 @@ import torch
 from nerfdiff.cli import load_config
 from nerfdiff.diffusion import layout
 from nerfdiff.diffusion.layout import channels_last
-from nerfdiff.evaluation.subject import dataset_subject
+from nerfdiff.evaluation.run import dataset_run
 from nerfdiff.utils.errors import ConfigError
 from training_fixtures import evaluation_overrides, last_checkpoint, run_training, write_dataset
 
@@ -44,6 +44,6 @@ def test_a_run_in_one_layout_goes_on_in_another_and_is_evaluated_in_either(tmp_p
         assert checkpoint["global_step"] == step + 1
         assert checkpoint["hyper_parameters"]["channels_last"] == chosen
         given = evaluation_overrides(data, run, tmp_path / "out", "data.image_size=[10,14]", layout_of_unets)
-        evaluated = dataset_subject(load_config("evaluate", given), CPU).model
+        evaluated = dataset_run(load_config("evaluate", given), CPU).model
         weight = evaluated.denoiser.unet.conv_in.weight
         assert weight.is_contiguous(memory_format=torch.channels_last) == chosen

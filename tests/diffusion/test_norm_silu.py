@@ -222,7 +222,7 @@ def test_where_kernels_fail_the_operators_take_over_with_one_line(monkeypatch, c
     def fail(*_):
         raise RuntimeError("no such device\nand more")
 
-    monkeypatch.setattr(module, "_told", set())
+    monkeypatch.setattr(module, "_warned", set())
     monkeypatch.setattr(module, "_fusible", lambda x: True)
     monkeypatch.setattr(module, "fused", fail)
     caplog.set_level(logging.WARNING, logger=module.__name__)
@@ -241,7 +241,7 @@ def test_where_the_backward_pass_fails_the_operators_take_over_with_one_line(mod
 
     tensors = inputs(32, (5, 3), modulated)
     _, expected = differentiate(reference, tensors, True)
-    monkeypatch.setattr(module, "_told", set())
+    monkeypatch.setattr(module, "_warned", set())
     monkeypatch.setattr(function, "_gradients", fail)
     caplog.set_level(logging.WARNING, logger=module.__name__)
     _, found = differentiate(fused, tensors, True)

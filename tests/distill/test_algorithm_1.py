@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from nerfdiff.diffusion.sampler import SAMPLERS
+from nerfdiff.diffusion.sampler import SAMPLERS, SamplerSettings
 from nerfdiff.diffusion.schedule import alpha_sigma, expand
-from nerfdiff.distill.ngd import Guidance, GuidedViews
+from nerfdiff.distill.ngd import Guidance, NGDTeacher
 from nerfdiff.distill.virtual_views import VirtualViews
 
 K, SHAPE = 5, (3, 2, 2)
@@ -43,7 +43,7 @@ def run(guidance: Guidance, std: float, steps: int, t_min=0.0, sampler="ddim"):
     means = 0.2 * torch.randn(K, *SHAPE, generator=torch.Generator().manual_seed(0)).clamp(-1.5, 1.5)
     start = torch.full(SHAPE, 0.4)
     views = GaussianViews(means, std, start)
-    teacher = GuidedViews(views, steps, 1.0, t_min, "uniform_t", sampler, 0.0, guidance, "first")
+    teacher = NGDTeacher(views, steps, SamplerSettings(1.0, t_min, "uniform_t", sampler, 0.0), guidance, "first")
     field, history = start, []
     for step in range(steps):
         targets = teacher.targets(step, (0.5 * (field + 1)).expand(K, *SHAPE))
@@ -117,6 +117,8 @@ def test_begun_at_less_than_one_the_views_are_the_noised_renderings():
     views.denoise = lambda z, t, rendered=None, deep=None: (
         (z - expand(alpha_sigma(t)[1], z) * views.fixed_noise) / expand(alpha_sigma(t)[0], z)
     )
-    teacher = GuidedViews(views, 4, 0.6, 0.0, "uniform_t", "ddim", 0.0, Guidance("constant", 0.0, "current"), "first")
+    teacher = NGDTeacher(
+        views, 4, SamplerSettings(0.6, 0.0, "uniform_t", "ddim", 0.0), Guidance("constant", 0.0, "current"), "first"
+    )
     targets = teacher.targets(0, torch.zeros(K, *SHAPE))
     torch.testing.assert_close(2 * targets - 1, start.expand(K, *SHAPE), atol=1e-5, rtol=0)

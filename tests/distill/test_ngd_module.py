@@ -8,14 +8,16 @@ import torch
 from model_fixtures import input_cameras, look_at, model
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.distill.direct import SampledViews
+from nerfdiff.diffusion.sampler import SamplerSettings
+from nerfdiff.distill.direct import DirectTeacher
 from nerfdiff.distill.distillation import Distillation
-from nerfdiff.distill.module import LOOKS, NGDModule
-from nerfdiff.distill.ngd import Guidance, GuidedViews
-from nerfdiff.distill.sds import DenoisedRenderings
-from nerfdiff.distill.stochastic import AutoregressiveViews
+from nerfdiff.distill.module import NGDModule
+from nerfdiff.distill.ngd import Guidance, NGDTeacher
+from nerfdiff.distill.sds import SDSTeacher
+from nerfdiff.distill.stochastic import StochasticTeacher
 from nerfdiff.fit.ray_batches import RayBatches
 from nerfdiff.fit.refined_field import RefinedField
+from nerfdiff.fit.settings import COARSE
 from nerfdiff.utils.errors import ConfigError
 
 
@@ -48,9 +50,13 @@ def prior(views: int):
     return cameras
 
 
+def sampling(sampler="ddim", eta=0.0) -> SamplerSettings:
+    return SamplerSettings(1.0, 0.0, "uniform_t", sampler, eta)
+
+
 def guided(gamma=0.3, schedule="snr", condition="first", sampler="ddim", eta=0.0):
     guidance = Guidance(schedule, gamma, "current")
-    return lambda views: GuidedViews(views, 4, 1.0, 0.0, "uniform_t", sampler, eta, guidance, condition)
+    return lambda views: NGDTeacher(views, 4, sampling(sampler, eta), guidance, condition)
 
 
 TEACHERS = {
@@ -58,11 +64,11 @@ TEACHERS = {
     "ngd, current": guided(condition="current"),
     "ngd, ancestral": guided(eta=1.0),
     "ngd, DPM-Solver++": guided(sampler="dpmpp_2m"),
-    "direct": lambda views: SampledViews(views, 4, 3, 1.0, 0.0, "uniform_t", "ddim", 0.0),
-    "direct, DPM-Solver++": lambda views: SampledViews(views, 4, 3, 1.0, 0.0, "uniform_t", "dpmpp_2m", 0.0),
-    "sds": lambda views: DenoisedRenderings(views, 4, 1.0, 0.02, "first"),
-    "stochastic": lambda views: AutoregressiveViews(views, 4, 3, 1.0, 0.0, "uniform_t", "ddim", 0.0),
-    "stochastic, DPM-Solver++": lambda views: AutoregressiveViews(views, 4, 3, 1.0, 0.0, "uniform_t", "dpmpp_2m", 0.0),
+    "direct": lambda views: DirectTeacher(views, 4, 3, sampling()),
+    "direct, DPM-Solver++": lambda views: DirectTeacher(views, 4, 3, sampling("dpmpp_2m")),
+    "sds": lambda views: SDSTeacher(views, 4, 1.0, 0.02, "first"),
+    "stochastic": lambda views: StochasticTeacher(views, 4, 3, sampling()),
+    "stochastic, DPM-Solver++": lambda views: StochasticTeacher(views, 4, 3, sampling("dpmpp_2m")),
 }
 
 
@@ -77,7 +83,8 @@ def distillation(teacher, views=3, inner_steps=3, rays=64, lr_planes=1e-2, **mor
         "cuda_graphs": True,
         "views_at_once": 2,
     } | more
-    return Distillation("test", prior(views), teacher, inner_steps, rays, lr_planes, **options)
+    fitted = {"inner_steps": inner_steps, "rays": rays, "lr_planes": lr_planes}
+    return Distillation("test", prior(views), teacher, **fitted, **options)
 
 
 @pytest.mark.parametrize("teacher", TEACHERS)
@@ -90,7 +97,7 @@ def test_every_teacher_fits_the_field_and_leaves_the_model_alone(teacher):
     assert all(torch.equal(before[name], value) for name, value in net.state_dict().items())
     assert not any(parameter.requires_grad for parameter in net.parameters())
     with torch.no_grad():
-        start = net.encode(scene().source, scene().source_cameras, scene().near, scene().far).triplane.planes
+        start = net.encode(scene()).triplane.planes
     assert not torch.allclose(module.field.planes, start)
     again = distillation(TEACHERS[teacher]).distil(net, [scene()], seed=0)
     assert torch.equal(again.field.planes, module.field.planes)
@@ -133,7 +140,7 @@ def test_a_scene_that_fails_leaves_the_others_alone():
     alone = distillation(TEACHERS["direct"]).distil(net, [scene("a")], seed=0)
     assert module.statuses == ["ok", "non-finite"] and bool(module.field.finite().all())
     torch.testing.assert_close(module.field.planes[:1], alone.field.planes)
-    start = net.encode(scene().source, scene().source_cameras, scene().near, scene().far).triplane.planes
+    start = net.encode(scene()).triplane.planes
     assert torch.equal(module.field.planes[1:], start)  # it failed at once: what was good is where it began
 
 
@@ -151,15 +158,15 @@ def test_scenes_that_do_not_fit_into_one_batch_are_refused():
         method.distil(net, [scene("a"), scene("b")], seed=0)
 
 
-@pytest.mark.parametrize("teacher", [guided(condition="last"), lambda v: DenoisedRenderings(v, 4, 1.0, 0.02, "last")])
+@pytest.mark.parametrize("teacher", [guided(condition="last"), lambda v: SDSTeacher(v, 4, 1.0, 0.02, "last")])
 def test_an_unknown_condition_is_refused_with_the_known_ones(teacher):
     with pytest.raises(ConfigError, match="choose first or current"):
         distillation(teacher).distil(model().requires_grad_(False), [scene()], seed=0)
 
 
-@pytest.mark.parametrize("teacher", [SampledViews, AutoregressiveViews])
+@pytest.mark.parametrize("teacher", [DirectTeacher, StochasticTeacher])
 def test_a_deterministic_sampler_refuses_noise(teacher):
-    noisy = [guided(sampler="dpmpp_2m", eta=1.0), lambda v: teacher(v, 4, 3, 1.0, 0.0, "uniform_t", "dpmpp_2m", 1.0)]
+    noisy = [guided(sampler="dpmpp_2m", eta=1.0), lambda v: teacher(v, 4, 3, sampling("dpmpp_2m", 1.0))]
     for made in noisy:
         with pytest.raises(ConfigError, match="eta=0, got eta=1"):
             distillation(made).distil(model().requires_grad_(False), [scene()], seed=0)
@@ -207,14 +214,14 @@ def test_coarse_weights_are_those_of_the_last_refresh(fit_source, monkeypatch):
     assert not torch.equal(checked[0], checked[-1])
 
 
-def test_the_input_view_is_looked_at_too_where_it_is_fitted():
+def test_the_input_view_is_rendered_too_where_it_is_fitted():
     net = model().requires_grad_(False)
     queries = {
         (coarse, fit_source): distillation(TEACHERS["ngd"], coarse=coarse, fit_source=fit_source)
         .distil(net, [scene()], 0)
         .views[0]
         .field_queries
-        for coarse in LOOKS
+        for coarse in COARSE
         for fit_source in (False, True)
     }
     view = 16 * 16 * net.renderer.samples_per_ray
@@ -223,13 +230,13 @@ def test_the_input_view_is_looked_at_too_where_it_is_fitted():
 
 
 @pytest.mark.parametrize("teacher", ["direct", "stochastic"])
-def test_where_nothing_is_rendered_on_the_way_every_step_looks_for_itself(teacher):
+def test_where_nothing_is_rendered_on_the_way_every_step_computes_its_own_coarse_weights(teacher):
     net = model().requires_grad_(False)
-    every, kept = (distillation(TEACHERS[teacher], coarse=c).distil(net, [scene()], seed=0) for c in LOOKS)
+    every, kept = (distillation(TEACHERS[teacher], coarse=c).distil(net, [scene()], seed=0) for c in COARSE)
     assert torch.equal(every.field.planes, kept.field.planes)
 
 
-def test_an_unknown_look_is_refused_with_the_known_ones():
+def test_an_unknown_choice_of_coarse_weights_is_refused_with_the_known_ones():
     with pytest.raises(ConfigError, match=r"strategy.coarse='never': choose every_step, refresh"):
         distillation(TEACHERS["ngd"], coarse="never").distil(model().requires_grad_(False), [scene()], seed=0)
 
@@ -246,7 +253,7 @@ def test_the_input_image_is_fitted_where_asked():
     def error(fit_source):
         module = distillation(guided(1.0, "constant"), inner_steps=60, fit_source=fit_source).distil(net, [scene()], 0)
         with torch.no_grad():
-            image = module.field.render(net.renderer, module.field.cameras[None]).rgb[0, 0].movedim(-1, 0)
+            image = module.field.render(net.renderer, module.field.cameras[None]).images[0, 0]
         return float((image - scene().source[0]).square().mean())
 
     assert error(True) < 0.8 * error(False)
@@ -262,7 +269,7 @@ def test_without_guidance_and_inner_steps_views_are_plain_samples():
     net = model(conditioning={"residual_std": 0.2}).requires_grad_(False)
     module = distillation(guided(0.0), inner_steps=0).distil(net, [scene()], seed=0)
     views = dataclasses.replace(
-        distillation(guided(0.0), inner_steps=0), teacher=lambda v: SampledViews(v, 1, 4, 1, 0, "uniform_t", "ddim", 0)
+        distillation(guided(0.0), inner_steps=0), teacher=lambda v: DirectTeacher(v, 1, 4, sampling())
     )
     sampled = views.distil(net, [scene()], seed=0)
     torch.testing.assert_close(module._last_targets, sampled._last_targets)
@@ -294,20 +301,18 @@ class Failing:
 
 def starting_planes(net):
     with torch.no_grad():
-        return net.encode(scene().source, scene().source_cameras, scene().near, scene().far).triplane.planes
+        return net.encode(scene()).triplane.planes
 
 
 def test_a_field_that_blows_up_falls_back_to_the_last_finite_one():
     net = model().requires_grad_(False)
 
-    class Poisoned(GuidedViews):
+    class Poisoned(NGDTeacher):
         def targets(self, step, rendered):
             images = super().targets(step, rendered)
             return images * float("nan") if step == 2 else images
 
-    poisoned = distillation(
-        lambda v: Poisoned(v, 4, 1.0, 0.0, "uniform_t", "ddim", 0.0, Guidance("snr", 0.3, "current"), "first")
-    )
+    poisoned = distillation(lambda v: Poisoned(v, 4, sampling(), Guidance("snr", 0.3, "current"), "first"))
     module = poisoned.distil(net, [scene()], seed=0)
     assert module.statuses == ["non-finite"] and bool(module.field.finite())
     assert not torch.equal(module.field.planes, starting_planes(net)), "two steps that did no harm are kept"
@@ -324,7 +329,7 @@ def test_what_was_finite_before_it_failed_must_stand_the_same_test(tolerance, at
     module = method.distil(net, [white], seed=0)
     assert module.statuses == ["non-finite" if at == 4 else "diverged" if tolerance < 1 else "ok"]
     with torch.no_grad():
-        start = net.encode(white.source, white.source_cameras, white.near, white.far).triplane.planes
+        start = net.encode(white).triplane.planes
     assert torch.equal(module.field.planes, start) == (tolerance < 1)
 
 
@@ -360,5 +365,5 @@ def test_a_field_made_worse_falls_back_to_where_it_began():
     net = model().requires_grad_(False)
     module = distillation(TEACHERS["direct"], lr_planes=1e4).distil(net, [scene()], seed=0)
     with torch.no_grad():
-        start = net.encode(scene().source, scene().source_cameras, scene().near, scene().far).triplane.planes
+        start = net.encode(scene()).triplane.planes
     assert module.statuses == ["diverged"] and torch.equal(module.field.planes, start)

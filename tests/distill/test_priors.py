@@ -9,7 +9,7 @@ import torch
 from nerfdiff.cameras import Cameras
 from nerfdiff.cli import load_config
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.distill.priors import Circle, OwnViews, Prior, Sphere, SRNSpiral, all_cameras, plane_normal
+from nerfdiff.distill.priors import Circle, Prior, SceneCameras, Sphere, SRNSpiral, all_cameras, plane_normal
 from nerfdiff.poses import look_at_origin
 from nerfdiff.trajectories import look_at_point
 from nerfdiff.utils.errors import ConfigError, DataError
@@ -63,7 +63,7 @@ def test_srn_spiral_is_every_fifth_test_camera_relative_to_the_input_view(near, 
     """Whatever near and far are: the radius is that of the scene's own cameras, or the one that is set."""
     source = spiral_pose(64, radius)
     others = [] if set_to else [spiral_pose(0, radius)]
-    cameras = SRNSpiral(50, 64, set_to)(scene([source, *others], near, far))
+    cameras = SRNSpiral(50, 64, set_to, 0.9)(scene([source, *others], near, far))
     assert cameras.shape == (1, 50)
     for k in (0, 7, 49):
         expected = np.linalg.inv(source) @ spiral_pose(5 * k, radius)
@@ -74,7 +74,7 @@ def test_srn_spiral_is_every_fifth_test_camera_relative_to_the_input_view(near, 
 @pytest.mark.parametrize("views", [1, 3, 100, 250, 251])
 def test_srn_spiral_has_no_view_twice(views):
     source = spiral_pose(64, 1.3)
-    cameras = SRNSpiral(views, 64, None)(scene([source, spiral_pose(0, 1.3)])).c2w[0]
+    cameras = SRNSpiral(views, 64, None, 0.9)(scene([source, spiral_pose(0, 1.3)])).c2w[0]
     assert len(cameras) == len(torch.unique(cameras, dim=0)) == views
     np.testing.assert_allclose(cameras[0], np.linalg.inv(source) @ spiral_pose(0, 1.3), atol=2e-6)
     if views == 251:
@@ -84,11 +84,12 @@ def test_srn_spiral_has_no_view_twice(views):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ((252, 64, None), r"prior\.views=252: expected 1 to 251"),
-        ((0, 64, None), r"prior\.views=0"),
-        ((50, 251, None), r"prior\.source_view=251: expected one of the spiral's, 0 to 250"),
-        ((50, -1, None), r"prior\.source_view=-1"),
-        ((50, 64, 0.0), r"prior\.radius=0\.0: expected a positive distance"),
+        ((252, 64, None, 0.9), r"prior\.views=252: expected 1 to 251"),
+        ((0, 64, None, 0.9), r"prior\.views=0"),
+        ((50, 251, None, 0.9), r"prior\.source_view=251: expected one of the spiral's, 0 to 250"),
+        ((50, -1, None, 0.9), r"prior\.source_view=-1"),
+        ((50, 64, 0.0, 0.9), r"prior\.radius=0\.0: expected a positive distance"),
+        ((50, 64, None, 1.0), r"prior\.min_cosine=1\.0: expected from 0 to less than 1"),
     ],
 )
 def test_srn_spiral_refuses_what_the_spiral_has_not(settings, message):
@@ -104,20 +105,31 @@ def test_srn_spiral_needs_cameras_that_look_at_one_point_or_a_radius(others):
     beside[:3, 3] += 0.2 * source[:3, 0]
     batch = scene([source, *([source, beside][k] for k in others)])
     with pytest.raises(DataError, match=r"scene a has no second camera.*set prior\.radius"):
-        SRNSpiral(50, 64, None)(batch)
+        SRNSpiral(50, 64, None, 0.9)(batch)
+
+
+def test_srn_spiral_takes_a_radius_within_its_cosine_alone():
+    """The input camera looks 40 degrees past the point that the others show to be the middle."""
+    off = np.deg2rad(40)
+    turn = np.eye(4)
+    turn[:3, :3] = [[np.cos(off), 0, np.sin(off)], [0, 1, 0], [-np.sin(off), 0, np.cos(off)]]
+    batch = scene([spiral_pose(64, 1.3) @ turn, *(spiral_pose(k, 1.3) for k in range(0, 250, 10))])
+    assert SRNSpiral(5, 64, None, 0.5)(batch).shape == (1, 5)
+    with pytest.raises(DataError, match=r"set prior\.radius"):
+        SRNSpiral(5, 64, None, 0.9)(batch)
 
 
 def test_own_views_are_the_inputs_and_the_others():
     world = [camera(c) for c in ((2, 0, 1), (0, 2, 1.2), (-2, 0.3, 0.8), (1, -2, 0.5))]
     batch = scene(world)
-    assert torch.equal(OwnViews(30)(batch).c2w[0], all_cameras(batch).c2w)
-    assert torch.equal(OwnViews(2)(batch).c2w[0], all_cameras(batch).c2w[[0, 2]])
+    assert torch.equal(SceneCameras(30)(batch).c2w[0], all_cameras(batch).c2w)
+    assert torch.equal(SceneCameras(2)(batch).c2w[0], all_cameras(batch).c2w[[0, 2]])
 
 
 def test_fewer_views_than_asked_for_are_said_once(caplog):
     batch = scene([camera(c) for c in ((2, 0, 1), (0, 2, 1.2), (-2, 0.3, 0.8))])
     for _ in range(2):
-        assert OwnViews(41)(batch).shape == OwnViews(3)(batch).shape == (1, 3)
+        assert SceneCameras(41)(batch).shape == SceneCameras(3)(batch).shape == (1, 3)
     assert len(caplog.messages) == 1
     assert "3 virtual views instead of the 41 of budget.views" in caplog.messages[0]
     assert "data.eval_stride" in caplog.messages[0]
@@ -197,7 +209,7 @@ def test_part_of_the_sphere_stays_on_the_inputs_side():
 
 
 def test_all_are_priors():
-    for prior in (SRNSpiral(5, 64, None), OwnViews(5), Circle(5), Sphere(5, (0.0, 1.0), (0.0, 1.0), 0.0)):
+    for prior in (SRNSpiral(5, 64, None, 0.9), SceneCameras(5), Circle(5), Sphere(5, (0.0, 1.0), (0.0, 1.0), 0.0)):
         assert isinstance(prior, Prior)
 
 

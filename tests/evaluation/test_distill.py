@@ -23,8 +23,8 @@ from nerfdiff.cli import load_config
 from nerfdiff.distill.distillation import Distillation
 from nerfdiff.distill.module import NGDModule
 from nerfdiff.distill.priors import Sphere
-from nerfdiff.evaluation.distill import _warn_of_inert, distill
-from nerfdiff.evaluation.subject import dataset_subject, picture_subject
+from nerfdiff.evaluation.distill import _warn_of_unused, distill
+from nerfdiff.evaluation.run import dataset_run, picture_run
 from nerfdiff.fit.saved_field import FIELD, load_field
 from nerfdiff.metrics.predictions import read_prediction
 from nerfdiff.metrics.score import Scorer
@@ -108,7 +108,7 @@ def test_k_is_the_number_of_views_that_fields_were_fitted_to(data, run, tmp_path
     for stride, asked, used in ((1, 4, 4), (1, 9, 5), (2, 9, 3)):
         settings = "prior=abo_views", f"budget.views={asked}", f"data.eval_stride={stride}", *small
         row = distill(config(data, run, tmp_path, *settings))
-        assert (row.K, row.prior) == (used, "OwnViews")
+        assert (row.K, row.prior) == (used, "SceneCameras")
         assert row.denoiser_calls == 2 * 2 * used  # scenes, steps
         assert (f"{used} virtual views instead of the {asked}" in caplog.text) == (used < asked)
     none = distill(config(data, run, tmp_path, "strategy=none", *small))
@@ -142,7 +142,7 @@ def test_scenes_with_different_numbers_of_views_are_told(data, run, tmp_path, mo
     ],
 )
 def test_what_cannot_act_on_a_picture_is_said(words, said, caplog):
-    _warn_of_inert(words)
+    _warn_of_unused(words)
     assert caplog.text == "" if said is None else said in caplog.text
 
 
@@ -150,11 +150,11 @@ def test_what_cannot_act_on_a_picture_is_said(words, said, caplog):
 def test_the_field_in_the_file_is_the_one_whose_views_were_saved(precision, data, run, tmp_path):
     cfg = config(data, run, tmp_path, f"precision={precision}", "strategy.lr_decoder=1e-2")
     distill(cfg)
-    (scene,) = dataset_subject(cfg, torch.device("cpu")).load(["scene1"])
+    (scene,) = dataset_run(cfg, torch.device("cpu")).load(["scene1"])
     folder = scene_folder(tmp_path, "ngd", "scene1")
     saved = load_field(folder / FIELD)
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16-mixed"):
-        images = saved.field.render(saved.renderer, scene.target_cameras).rgb[0].movedim(-1, 1)
+        images = saved.field.render(saved.renderer, scene.target_cameras).images[0]
     pixels = read_prediction(folder.parent, "scene1").pixels
     assert (pixels / 255 - images.float().clamp(0, 1)).abs().max() < (0.51 if precision == "32-true" else 2.0) / 255
 
@@ -307,7 +307,7 @@ def test_equal_pictures_of_several_names_are_scenes_of_their_own(data, run, tmp_
     other = picture.with_name("a=b, c (1).png")
     shutil.copy(picture, other)
     configs = [config(data, run, tmp_path, f"image={path}") for path in (picture, other)]
-    first, second = (picture_subject(cfg, torch.device("cpu")) for cfg in configs)
+    first, second = (picture_run(cfg, torch.device("cpu")) for cfg in configs)
     assert (first.scene_ids, second.scene_ids) == (["red_car"], ["a_b_c_1"]) and first.folder != second.folder
 
 
@@ -357,10 +357,10 @@ def test_processes_that_cannot_be_had_are_refused(setting, data, run, tmp_path):
 def test_no_method_sees_the_truth(strategy, data, run, tmp_path):
     """Other target images, depths and masks: the same predictions, bit for bit."""
     cfg = config(data, run, tmp_path, f"strategy={strategy}")
-    subject = dataset_subject(cfg, torch.device("cpu"))
-    (scene,) = subject.load(["scene0"])
+    evaluation = dataset_run(cfg, torch.device("cpu"))
+    (scene,) = evaluation.load(["scene0"])
     other = dataclasses.replace(scene, target_pixels=255 - scene.target_pixels, target_depth=None, target_mask=None)
-    first, second = (instantiate(cfg.strategy).predict(subject.model, [batch], 0)[0] for batch in (scene, other))
+    first, second = (instantiate(cfg.strategy).predict(evaluation.model, [batch], 0)[0] for batch in (scene, other))
     assert torch.equal(first.images, second.images)
 
 

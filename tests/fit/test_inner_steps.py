@@ -43,9 +43,9 @@ def inner_steps(
 ) -> InnerSteps:
     device = field.planes.device
     batches = RayBatches(views(len(field)).to(device), field.near, field.far)
-    batches.paint(images)
+    batches.set_colours(images)
     if coarse is not None:
-        batches.remember(coarse)
+        batches.set_coarse(coarse)
     rates = torch.tensor([1e-2, 1e-3], device=device)
     optimizer = torch.optim.Adam(
         [{"params": [field.planes], "lr": rates[0]}, {"params": list(field.decoder.parameters()), "lr": rates[1]}],
@@ -99,7 +99,7 @@ def test_painting_changes_what_is_fitted_and_drawing_goes_on():
     inner = inner_steps(field, images)
     inner.run(2)
     first = inner._picked.clone()
-    inner.batches.paint(torch.zeros_like(images))
+    inner.batches.set_colours(torch.zeros_like(images))
     inner.run(2)
     assert not torch.equal(inner._picked, first)
     assert inner.batches.at(inner._picked[:, 0])[1].eq(0).all()
@@ -109,7 +109,7 @@ def test_what_is_remembered_anew_stays_in_its_place():
     """A recorded step reads memory, not names."""
     inner = inner_steps(fields(1), torch.rand(1, 2, 3, SIZE, SIZE), coarse=torch.zeros(1, 2, SIZE, SIZE, 4))
     before = inner.batches._coarse.data_ptr()
-    inner.batches.remember(torch.ones(1, 2, SIZE, SIZE, 4))
+    inner.batches.set_coarse(torch.ones(1, 2, SIZE, SIZE, 4))
     assert inner.batches._coarse.data_ptr() == before
     assert inner.batches.coarse_at(torch.tensor([[3, 500]])).eq(1).all()
 
@@ -196,8 +196,8 @@ def test_a_recorded_step_does_what_the_step_does(remembered):
     for _ in range(2):  # the second time, everything is replayed
         if remembered:
             coarse = torch.rand(2, 2, SIZE, SIZE, RENDERER.uniform_samples, device="cuda").pow(4)
-            plain.batches.remember(coarse)
-            replayed.batches.remember(coarse)
+            plain.batches.set_coarse(coarse)
+            replayed.batches.set_coarse(coarse)
         torch.testing.assert_close(replayed.run(8), plain.run(8), atol=1e-5, rtol=1e-3)
         replayed.optimizer.param_groups[0]["lr"].mul_(0.5)
         plain.optimizer.param_groups[0]["lr"].mul_(0.5)

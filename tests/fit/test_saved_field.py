@@ -17,7 +17,7 @@ from nerfdiff.utils.files import write_text
 def saved() -> SavedField:
     net = model().requires_grad_(False)
     source = input_cameras(1, 16, 24)
-    encoding = net.encode(torch.rand(1, 3, 16, 24), source, torch.tensor([0.8]), torch.tensor([1.8]))
+    encoding = net.encode_images(torch.rand(1, 3, 16, 24), source, torch.tensor([0.8]), torch.tensor([1.8]))
     return SavedField(RefinedField(encoding.triplane, net.decoder), net.renderer)
 
 
@@ -26,7 +26,7 @@ def test_it_renders_the_same_without_the_checkpoint(saved, tmp_path):
     loaded = load_field(tmp_path / FIELD)
     cameras = Cameras(look_at((0.5, 0.2, 0.4))[None, None], saved.field.K[:, None], 12, 20)
     before, after = (s.field.render(s.renderer, cameras) for s in (saved, loaded))
-    assert torch.equal(before.rgb, after.rgb) and torch.equal(before.depth, after.depth)
+    assert torch.equal(before.images, after.images) and torch.equal(before.depth, after.depth)
     assert loaded.renderer == saved.renderer
     assert (loaded.field.cameras.height, loaded.field.cameras.width) == (16, 24)
 

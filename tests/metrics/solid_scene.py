@@ -32,7 +32,7 @@ def ball_distance(rays: Rays, centre, radius):
 def balls(*parts, density=1000.0):
     """A field of solid balls (centre, radius), coloured by where they are."""
 
-    def field(points):
+    def field(points, directions=None):
         inside = torch.zeros(points.shape[:-1], dtype=torch.bool)
         for centre, radius in parts:
             inside |= (points - torch.tensor(centre)).norm(dim=-1) < radius

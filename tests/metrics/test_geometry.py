@@ -50,7 +50,7 @@ def test_faint_density_counts_by_its_opacity(cameras, silhouettes):
     """Fog of optical depth τ from near to far along every ray: where the solid is not, 1 − exp(−τ) is outside."""
     tau, solid = 0.1, balls((CENTRE, RADIUS))
 
-    def foggy(points):
+    def foggy(points, directions):
         rgb, density = solid(points)
         return rgb, density + tau / (FAR - NEAR)
 
@@ -83,7 +83,7 @@ def test_silhouettes_are_widened_by_the_margin(cameras):
     one = torch.zeros(1, 32, 32, dtype=torch.bool)
     one[:, 12:20, 12:20] = True
     # A wall before the camera, wider than the silhouette of 8×8: 10×10 of its pixels are forgiven.
-    wall = lambda points: (points, ((points[..., 2] > 1.2) & (points[..., 2] < 1.4)) * 1000.0)  # noqa: E731
+    wall = lambda points, directions: (points, ((points[..., 2] > 1.2) & (points[..., 2] < 1.4)) * 1000.0)  # noqa: E731
     assert share(wall, cameras[:1], one, margin=0) == pytest.approx(1 - 64 / 1024, rel=1e-3)
     assert share(wall, cameras[:1], one, margin=1) == pytest.approx(1 - 100 / 1024, rel=1e-3)
 

@@ -11,7 +11,7 @@ def fresh_backend(monkeypatch, caplog):
     from fused_scenes import without_trials
     from nerfdiff.render import backend
 
-    for name, value in (("_told", set()), ("_failures", {}), ("_trusted", set())):
+    for name, value in (("_warned", set()), ("_failures", {}), ("_trusted", set())):
         monkeypatch.setattr(backend, name, value)
     without_trials(monkeypatch)
     backend._missing.cache_clear()

@@ -21,7 +21,7 @@ def bundle() -> Rays:
     return Rays(torch.zeros(1, N, 3), directions, torch.full((1, N), NEAR), torch.full((1, N), FAR))
 
 
-def blobs(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def blobs(points: torch.Tensor, directions: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
     x, y, z = points.unbind(-1)
     density = 30 * torch.exp(-60 * ((z - 1.2) ** 2 + x**2 + (y - 0.05) ** 2)) + 4 * torch.sin(9 * z + x).square()
     return torch.sigmoid(torch.stack([5 * x, 5 * y, 8 * (z - 1.3)], -1)), density
@@ -62,7 +62,7 @@ def test_given_weights_decide_where_samples_fall(jittered, chunk):
     jitter = torch.rand(1, N, 6 + 4, generator=g) if jittered else None
     seen = []
 
-    def counted(points):
+    def counted(points, directions):
         seen.append(points.shape[1])
         return blobs(points)
 

@@ -60,7 +60,7 @@ def test_no_triton(monkeypatch, caplog):
 
 def test_other_fields(caplog):
     scene = BackendScene()
-    scene.taken_over(caplog, "not a triplane", field=lambda points: scene.field(points))
+    scene.taken_over(caplog, "not a triplane", field=lambda *given: scene.field(*given))
 
 
 def test_float64(caplog):

@@ -25,7 +25,7 @@ def rays(n: int, dtype=torch.float32) -> Rays:
     return Rays(torch.zeros(1, n, 3, dtype=dtype), directions, near, far)
 
 
-def blobs(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def blobs(points: torch.Tensor, directions: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
     """A smooth field with structure along every axis."""
     x, y, z = points.unbind(-1)
     density = 30 * torch.exp(-60 * ((z - 1.2) ** 2 + x**2 + (y - 0.05) ** 2)) + 4 * torch.sin(9 * z + x).square()
@@ -59,7 +59,7 @@ def test_few_samples_give_the_dense_integral(uniform, importance, tolerance):
 
 
 def test_importance_samples_help_where_density_is_concentrated():
-    def wall(points):
+    def wall(points, directions=None):
         return torch.zeros_like(points), 300 * torch.exp(-((points[..., 2] - 1.31) ** 2) / (2 * 0.01**2))
 
     bundle = rays(16)
@@ -87,7 +87,7 @@ def test_jittered_samples_are_unbiased():
 
 
 def test_constant_density_has_the_closed_form():
-    def fog(points):
+    def fog(points, directions=None):
         return torch.full_like(points, 0.25), torch.full(points.shape[:-1], 2.0)
 
     out = renderer(16, 16).render(fog, rays(3))
@@ -97,7 +97,7 @@ def test_constant_density_has_the_closed_form():
 
 
 def test_empty_space_shows_the_background_at_the_far_end():
-    def nothing(points):
+    def nothing(points, directions=None):
         return torch.zeros_like(points), torch.zeros(points.shape[:-1])
 
     out = renderer(8, 8, background=0.3).render(nothing, rays(4))
@@ -109,7 +109,7 @@ def test_empty_space_shows_the_background_at_the_far_end():
 def test_without_a_background_the_farthest_sample_is_opaque():
     """Same as a wall of the field's own colour at the far end: against a naive loop over the samples."""
 
-    def haze(points):
+    def haze(points, directions=None):
         return points.abs().clamp(0, 1), 0.4 + points[..., 2] ** 2
 
     bundle = rays(4)
@@ -140,7 +140,7 @@ def test_no_ray_at_all():
     assert renderer().render(blobs, none).rgb.shape == (1, 0, 3)
 
 
-def coloured_points(points):
+def coloured_points(points, directions=None):
     """Three small balls of different colours at places that share no symmetry (input camera space)."""
     rgb, density = torch.zeros_like(points), torch.zeros(points.shape[:-1])
     for centre, colour in BALLS:
@@ -163,12 +163,12 @@ def test_known_points_appear_at_their_projections(centre):
     source = input_cameras(1, 48, 64)
     camera = Cameras(look_at(centre)[None, None], source.K[None], 48, 64)
     near, far = torch.tensor([0.6]), torch.tensor([2.0])
-    image = renderer(256, 0, background=1.0).render_views(coloured_points, camera, near, far).rgb[0, 0]
+    image = renderer(256, 0, background=1.0).render_views(coloured_points, camera, near, far).images[0, 0]
     for ball, colour in BALLS:
         # Projected by hand: world to camera is Rᵀ(x − C), then K.
         local = camera.c2w[0, 0, :3, :3].T @ (torch.tensor(ball) - torch.tensor(centre))
         u, v = (source.K[0, :2, :2] @ (local[:2] / local[2]) + source.K[0, :2, 2]).tolist()
-        distance = (image - torch.tensor(colour)).abs().sum(-1)
+        distance = (image - torch.tensor(colour)[:, None, None]).abs().sum(0)
         rows, columns = torch.nonzero(distance < 0.6, as_tuple=True)
         assert len(rows) >= 3
         assert float(columns.float().mean()) + 0.5 == pytest.approx(u, abs=0.8)
@@ -212,13 +212,13 @@ def test_gradients_reach_planes_through_importance_samples_as_through_fixed_ones
     moved = triplane_field(planes.detach() + step, decoder)
     still = triplane_field(planes.detach(), decoder)
 
-    def remember(points):  # the points that the unmoved field chooses
+    def remember(points, directions=None):  # the points that the unmoved field chooses
         seen.append(points)
         return still(points)
 
     renderer(6, 6).render(remember, bundle)
     replay = iter(seen)
-    frozen = renderer(6, 6).render(lambda points: _at(moved, still, points, next(replay), len(seen)), bundle)
+    frozen = renderer(6, 6).render(lambda points, _: _at(moved, still, points, next(replay), len(seen)), bundle)
     change = (frozen.rgb - target).square().sum() - (out.rgb - target).square().sum()
     assert change.item() == pytest.approx((gradient * step).sum().item(), rel=2e-2)
 

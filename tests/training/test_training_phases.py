@@ -61,11 +61,11 @@ def test_each_part_can_be_trained_alone(batch):
 
 def test_all_rays_in_another_order_give_the_same_loss(batch):
     made = module({"lambda_dm": 0})
-    encoding = made.model.encode(batch.source, batch.source_cameras, batch.near, batch.far)
+    encoding = made.model.encode(batch)
     every = torch.stack([torch.randperm(2 * 64, generator=torch.Generator().manual_seed(seed)) for seed in (1, 2)])
     jitter = torch.full((2, 128, made.model.renderer.samples_per_ray), 0.5)
     some = made._on_some_rays(batch, encoding, every, jitter)
-    rendered = made.model.render(encoding, batch.target_cameras, jitter).rgb.movedim(-1, 2)
+    rendered = made.model.render(encoding, batch.target_cameras, jitter).images
     torch.testing.assert_close(some, F.mse_loss(rendered, batch.targets))
     # a ray's own colour: the loss on one ray is that pixel's error
     one = made._on_some_rays(batch, encoding, torch.tensor([[70], [70]]), jitter[:, :1])
@@ -101,7 +101,7 @@ def test_every_target_has_a_time_of_its_own(batch, monkeypatch):
 
 def test_kept_renderings_are_what_would_be_rendered(batch, tmp_path):
     plain, keeping = module({"lambda_ic": 0}), module({"lambda_ic": 0}, kept_renderings=str(tmp_path))
-    encoding = plain.model.encode(batch.source, batch.source_cameras, batch.near, batch.far)
+    encoding = plain.model.encode(batch)
     with torch.no_grad():
         rendered = plain._rendered(batch, encoding)
         first, second = keeping._rendered(batch, encoding), keeping._rendered(batch, encoding)

@@ -1,4 +1,4 @@
-"""The building blocks of the ADM U-Net (Dhariwal & Nichol 2021)."""
+"""The building blocks of the ADM U-Net (Dhariwal & Nichol 2021, arXiv 2105.05233)."""
 
 import math
 from typing import NamedTuple
@@ -21,7 +21,7 @@ def zero(module: nn.Module) -> nn.Module:
 
 
 def norm(channels: int) -> nn.GroupNorm:
-    """ADM's GroupNorm of 32 groups.
+    """Make ADM's GroupNorm of 32 groups.
 
     Raises:
         ValueError: channels is not a multiple of 32.
@@ -32,7 +32,7 @@ def norm(channels: int) -> nn.GroupNorm:
 
 
 def time_embedding(t: Float[Tensor, "batch"], channels: int) -> Float[Tensor, "batch channels"]:
-    """Sinusoidal embedding of 1000 t, as DDPM's of integer steps."""
+    """Return a sinusoidal embedding of 1000 t, as DDPM's of integer steps (arXiv 2006.11239)."""
     half = channels // 2
     frequencies = torch.exp(-math.log(10_000) * torch.arange(half, device=t.device) / half)
     angles = 1000 * t.float()[:, None] * frequencies
@@ -62,7 +62,7 @@ class ResBlock(nn.Module):
 
 
 class KeyValue(NamedTuple):
-    """What attention looks up, split into heads: of a context that stays, worth computing once.
+    """Keys and values of attention, split into heads; computed once for a context that stays.
 
     Args:
         key, value: one entry per scene; the images that attend to it may be several views of each.
@@ -104,14 +104,14 @@ class Attention(nn.Module):
             context = self._split_keys_values(h)
         elif not isinstance(context, KeyValue):
             context = self.keys_values(context)
-        # All views of a scene look the same things up: they are queries of one attention, and nothing is repeated.
+        # All views of a scene attend to the same context: they are queries of one attention, and nothing is repeated.
         query = _pointwise(self.query, h).reshape(len(context.key), -1, channels)
         attended = F.scaled_dot_product_attention(self._split(query), *context)
         out = _pointwise(self.out, attended.transpose(1, 2).flatten(2))
         return x + out.reshape(batch, height * width, channels).mT.unflatten(2, (height, width))
 
     def keys_values(self, context: Float[Tensor, "scenes channels _h _w"]) -> KeyValue:
-        """What `forward` looks up in a context, without looking."""
+        """Return the keys and values of a context, for `forward` to attend to."""
         return self._split_keys_values(_rows(group_norm(self.norm_context, context)))
 
     def _split_keys_values(self, rows: Float[Tensor, "scenes pixels channels"]) -> KeyValue:
@@ -126,7 +126,7 @@ def _rows(x: Features) -> Float[Tensor, "batch pixels channels"]:
 
 
 def _pointwise(conv: nn.Conv2d, rows: Float[Tensor, "batch pixels channels"]) -> Float[Tensor, "batch pixels out"]:
-    """A 1 x 1 convolution of pixels that are rows."""
+    """Apply a 1 x 1 convolution to pixels that are rows."""
     return F.linear(rows, conv.weight.flatten(1), conv.bias)
 
 
@@ -157,7 +157,7 @@ class Upsample(nn.Module):
 
 
 def doubling_kernel(weight: Float[Tensor, "out channels 3 3"]) -> Float[Tensor, "channels out 4 4"]:
-    """The transposed convolution of stride 2 that equals doubling by nearest neighbours, then convolving.
+    """Return the transposed convolution of stride 2 that equals doubling by nearest neighbours, then convolving.
 
     Under the three taps a, b, c lie two different pixels: for an even output a | b + c, for an odd one a + b | c. So a
     transposed kernel of four taps c, b + c, a + b, a has 4/9 of the multiplications.

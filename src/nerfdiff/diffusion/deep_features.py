@@ -1,4 +1,4 @@
-"""Reuse of a U-Net's deep levels between neighbouring diffusion steps (DeepCache, Ma et al. 2024)."""
+"""Reuse of a U-Net's deep levels between neighbouring diffusion steps (DeepCache, Ma et al. 2024, arXiv 2312.00858)."""
 
 from dataclasses import dataclass
 
@@ -9,10 +9,10 @@ from nerfdiff.utils.errors import ConfigError
 
 @dataclass(frozen=True)
 class DeepReuse:
-    """How often deep levels are computed.
+    """Settings of the reuse of deep levels.
 
     From one diffusion step to the next, coarse features change little and fine ones much. So all but the first levels
-    may run at every `every`-th step only, and in between their last output is taken for what they would have said. It
+    may run at every `every`-th step only, and in between their last output is reused. It
     is an approximation, and only for steps that follow each other along one reverse process.
 
     Args:
@@ -32,7 +32,7 @@ class DeepReuse:
 
 
 class DeepFeatures:
-    """What the deep levels gave the last time they were computed, along one reverse process.
+    """The last output of the deep levels, along one reverse process.
 
     Args:
         reuse: how often that is.
@@ -45,9 +45,9 @@ class DeepFeatures:
         self._calls = 0
 
     def advance(self) -> None:
-        """One call of the U-Net begins: are its deep levels `due`, or is their `last` output taken?
+        """Begin a call of the U-Net: decide if its deep levels are `due`, or their `last` output is reused.
 
-        Not for the U-Net to say, which would be compiled anew for every number of calls.
+        The U-Net does not count itself: it would be compiled anew for every number of calls.
         """
         self.due = self._calls % self.reuse.every == 0
         self._calls += 1

@@ -12,6 +12,7 @@ from nerfdiff.diffusion.deep_features import DeepFeatures
 from nerfdiff.diffusion.schedule import alpha_sigma, expand, x0_from_v
 from nerfdiff.diffusion.unet import Context, UNet
 from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.images import to_signed
 
 IMAGES = ("rendered", "source", "none")
 
@@ -23,11 +24,11 @@ def gaussian_velocity(
     alpha: Float[Tensor, "*#shape"],
     sigma: Float[Tensor, "*#shape"],
 ) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*#shape"]]:
-    """Mean and standard deviation of v given Z_t, for x0 ~ N(mean, std²).
+    """Return mean and standard deviation of v given Z_t, for x0 ~ N(mean, std²).
 
     With D = Z − α·mean, E[x0 | Z] = mean + std²α D / (std²α² + σ²), and v = (αZ − x0) / σ becomes
     ασ(1 − std²) D / (std²α² + σ²) − σ·mean, with no division by σ alone. What remains to be learnt is of unit
-    scale at every t once divided by the standard deviation, as in EDM (Karras et al. 2022, eq. 7), whose data
+    scale at every t once divided by the standard deviation, as in EDM (arXiv 2206.00364, eq. 7), whose data
     have mean zero.
     """
     variance = std**2 * alpha**2 + sigma**2
@@ -37,14 +38,14 @@ def gaussian_velocity(
 
 @dataclass(frozen=True)
 class Condition:
-    """What the CDM may look at. All but the context share the batch axis, one entry per view to denoise.
+    """Inputs that condition the CDM. All but the context share the batch axis, one entry per view to denoise.
 
     Args:
         rendered: the single-image NeRF's image of the view, in [0, 1].
         source: the input image, in [0, 1].
         cameras: cameras of the views, in the input camera's space.
         near: t_n per view, to which camera positions are relative.
-        context: what cross-attention attends to, one entry per scene where the batch is scenes · views, scene by scene.
+        context: attended to by cross-attention, one entry per scene where the batch is scenes · views, scene by scene.
     """
 
     rendered: Float[Tensor, "batch 3 height width"]
@@ -94,14 +95,14 @@ class Denoiser(nn.Module):
         condition: Condition,
         deep: DeepFeatures | None = None,
     ) -> Float[Tensor, "batch 3 height width"]:
-        """The predicted v_t.
+        """Predict v_t.
 
         Args:
             deep: levels of the U-Net that are not computed at every call.
         """
         inputs = [z]
         if self.image != "none":
-            inputs.append(2 * getattr(condition, self.image) - 1)
+            inputs.append(to_signed(getattr(condition, self.image)))
         if self.ray_maps:
             rays = condition.cameras.rays(condition.near, condition.near)
             origins = rays.origins / rays.near[..., None]
@@ -113,7 +114,7 @@ class Denoiser(nn.Module):
         if self.residual_std is None:
             return output
         alpha, sigma = (expand(c, z) for c in alpha_sigma(t))
-        mean, scale = gaussian_velocity(z, 2 * condition.rendered - 1, self.residual_std, alpha, sigma)
+        mean, scale = gaussian_velocity(z, to_signed(condition.rendered), self.residual_std, alpha, sigma)
         return mean + scale * output
 
     def forward(
@@ -123,6 +124,6 @@ class Denoiser(nn.Module):
         condition: Condition,
         deep: DeepFeatures | None = None,
     ) -> Float[Tensor, "batch 3 height width"]:
-        """The denoised images x0."""
+        """Predict the denoised images x0."""
         alpha, sigma = (expand(c, z) for c in alpha_sigma(t))
         return x0_from_v(z, self.velocity(z, t, condition, deep), alpha, sigma)

@@ -1,4 +1,4 @@
-"""Which memory layout the U-Nets get, in training and evaluation alike."""
+"""The memory layout of the U-Nets, in training and evaluation."""
 
 import torch
 
@@ -7,7 +7,7 @@ from nerfdiff.utils.errors import ConfigError
 
 
 def channels_last(choice: object, device: torch.device, compiled: bool) -> bool:
-    """Whether images are kept pixel by pixel (channels_last), not channel by channel.
+    """Return true for channels_last: images are stored pixel by pixel, not channel by channel.
 
     Convolutions of a CPU and compiled U-Nets want them so. On a GPU, eager, it takes the fused norms: PyTorch's own
     turn each image back.

@@ -18,11 +18,11 @@ log = logging.getLogger(__name__)
 Features = Float[Tensor, "batch channels height width"]
 Modulation = Float[Tensor, "batch 2*channels"]
 
-_told: set[str] = set()
+_warned: set[str] = set()
 
 
 def norm_silu(norm: nn.GroupNorm, x: Features, scale_shift: Modulation | None = None) -> Features:
-    """SiLU(norm(x) · (1 + scale) + shift).
+    """Return SiLU(norm(x) · (1 + scale) + shift).
 
     Fused for images in channels_last on a GPU, unless a compiler fuses all that is around it too. Where kernels fail,
     one line says why, and the operators take over.
@@ -34,17 +34,17 @@ def norm_silu(norm: nn.GroupNorm, x: Features, scale_shift: Modulation | None = 
 
 
 def group_norm(norm: nn.GroupNorm, x: Features) -> Features:
-    """norm(x), by the same choice as `norm_silu`."""
+    """Return norm(x), by the same choice as `norm_silu`."""
     return _either(norm, x, None, False)
 
 
 def reference(norm: nn.GroupNorm, x: Features, scale_shift: Modulation | None = None, active: bool = True) -> Features:
-    """`norm_silu`, or without SiLU where not active, in PyTorch's operators."""
+    """Compute `norm_silu`, or without SiLU where not active, in PyTorch's operators."""
     return _after_norm(norm(x), scale_shift, active)
 
 
 def fused(norm: nn.GroupNorm, x: Features, scale_shift: Modulation | None = None, active: bool = True) -> Features:
-    """`reference` in kernels, computed in fp32, in the type that the next product would round it to."""
+    """Compute `reference` by kernels in fp32, and round to the type of the next product."""
     from nerfdiff.diffusion.kernels.function import Settings, fused_norm
 
     device = x.device.type
@@ -55,7 +55,7 @@ def fused(norm: nn.GroupNorm, x: Features, scale_shift: Modulation | None = None
 
 @cache
 def kernels_run(device: torch.device) -> bool:
-    """Whether there are kernels for a device: a GPU of compute capability 8.0 or newer, with Triton."""
+    """Return true if there are kernels for a device: a GPU of compute capability 8.0 or newer, with Triton."""
     return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0) and _importable()
 
 
@@ -79,8 +79,8 @@ def _after_norm(h: Features, scale_shift: Modulation | None, active: bool) -> Fe
 
 
 def _fusible(x: Tensor) -> bool:
-    """Whether the kernels are right for these images."""
-    if _told or not kernels_run(x.device):
+    """Return true if the kernels suit these images."""
+    if _warned or not kernels_run(x.device):
         return False
     laid_out = x.is_contiguous(memory_format=torch.channels_last) and not x.is_contiguous()
     return laid_out and x.dtype in (torch.float32, torch.bfloat16, torch.float16) and x.numel() > 0
@@ -95,7 +95,7 @@ def _importable() -> bool:
 
 
 def _recover(settings, error: Exception, tensors, gradient: Tensor, needed) -> list[Tensor | None]:
-    """The operators' gradients, in fp32, of what the kernels made."""
+    """Compute the gradients of the kernels' output by the operators, in fp32."""
     _give_up(error)
     leaves = [None if t is None else t.detach().requires_grad_(need) for t, need in zip(tensors, needed, strict=True)]
     with torch.enable_grad(), torch.autocast(gradient.device.type, enabled=False):
@@ -110,6 +110,6 @@ def _recover(settings, error: Exception, tensors, gradient: Tensor, needed) -> l
 def _give_up(error: Exception) -> None:
     lines = str(error).strip().splitlines()
     reason = f"{type(error).__name__}: {lines[0] if lines else 'no message'}"
-    if reason not in _told:
-        _told.add(reason)
+    if reason not in _warned:
+        _warned.add(reason)
         log.warning("no fused GroupNorm and SiLU, PyTorch's operators take over (%s)", reason)

@@ -1,11 +1,12 @@
-"""Following the reverse process: DDIM, or DPM-Solver++(2M) in fewer steps, behind one interface.
+"""The reverse process: DDIM, or DPM-Solver++(2M) in fewer steps, behind one interface.
 
-A sampler only ever sees denoised images. Whoever calls it may change them before each step, which is how views are
-guided: the guided x̃0 goes in where x0 does.
+A sampler takes denoised images. Its caller may change them before each step, which is how views are guided: the guided
+x̃0 takes the place of x0.
 """
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Protocol, runtime_checkable
 
@@ -13,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfdiff.diffusion.deep_features import DeepReuse
 from nerfdiff.diffusion.schedule import alpha_sigma, eps_from_x0
 from nerfdiff.utils.errors import ConfigError
 
@@ -20,7 +22,7 @@ Images = Float[Tensor, "batch 3 height width"]
 
 
 def ddim_step(z: Images, x0: Images, t: Tensor, t_next: Tensor, eta: float, noise: Images | None) -> Images:
-    """One step from Z_t to Z_{t_next} given the denoised x0 (Song et al. 2020, DDIM, eq. 12 and 16).
+    """Step from Z_t to Z_{t_next} given the denoised x0 (DDIM, arXiv 2010.02502, eq. 12 and 16).
 
     Args:
         t, t_next: scalars, t > t_next.
@@ -39,13 +41,13 @@ def ddim_step(z: Images, x0: Images, t: Tensor, t_next: Tensor, eta: float, nois
 
 @runtime_checkable
 class Sampler(Protocol):
-    """One run of the reverse process; it may remember its earlier steps, so every run has its own."""
+    """A sampler of one run of the reverse process; it may keep earlier steps, so every run has its own."""
 
     needs_noise: bool
-    """Whether steps want fresh noise."""
+    """True if steps take fresh noise."""
 
     def step(self, z: Images, x0: Images, t: Tensor, t_next: Tensor, noise: Images | None) -> Images:
-        """From Z_t to Z_{t_next}.
+        """Step from Z_t to Z_{t_next}.
 
         Args:
             x0: the denoised images, guided or not.
@@ -55,7 +57,7 @@ class Sampler(Protocol):
 
 
 class DDIM:
-    """Song et al. 2020; first order in the step.
+    """Song et al. 2020, arXiv 2010.02502; first order in the step.
 
     Args:
         eta: 0 is deterministic, 1 is ancestral sampling.
@@ -94,7 +96,7 @@ class DPMSolverPP2M:
 
 
 def half_log_snr(t: Tensor) -> Tensor:
-    """λ = log(α/σ), from ∞ at t = 0 to −∞ at t = 1."""
+    """Return λ = log(α/σ), from ∞ at t = 0 to −∞ at t = 1."""
     alpha, sigma = alpha_sigma(t)
     return alpha.log() - sigma.log()
 
@@ -103,8 +105,36 @@ SAMPLERS = ("ddim", "dpmpp_2m")
 SPACINGS = ("uniform_t", "uniform_lambda")
 
 
+@dataclass(frozen=True)
+class SamplerSettings:
+    """Settings of the reverse process; `conf/common/sampler.yaml` has them.
+
+    Args:
+        t_max, t_min: times where it starts and ends, in [0, 1].
+        spacing: of the times between, `uniform_t` or `uniform_lambda` (see `time_steps`).
+        sampler: `ddim` or `dpmpp_2m`.
+        eta: DDIM's η; 0 is deterministic given the initial noise.
+        deep: how often the U-Net's deep levels are computed; None: at each step.
+    """
+
+    t_max: float
+    t_min: float
+    spacing: str
+    sampler: str
+    eta: float
+    deep: DeepReuse | None = None
+
+    def begin(self) -> Sampler:
+        """Make a sampler for one run, see `make_sampler`."""
+        return make_sampler(self.sampler, self.eta)
+
+    def times(self, steps: int, device=None) -> Float[Tensor, "{steps}+1"]:
+        """Return the times of so many steps, see `time_steps`."""
+        return time_steps(steps, self.t_max, self.t_min, self.spacing, device)
+
+
 def make_sampler(name: str, eta: float) -> Sampler:
-    """A sampler for one run.
+    """Make a sampler for one run.
 
     Args:
         name: `ddim` or `dpmpp_2m`.
@@ -123,7 +153,7 @@ def make_sampler(name: str, eta: float) -> Sampler:
 
 
 def time_steps(n: int, t_max: float, t_min: float, spacing: str, device=None) -> Float[Tensor, "{n}+1"]:
-    """n + 1 times from t_max down to t_min.
+    """Return n + 1 times from t_max down to t_min.
 
     Args:
         spacing: `uniform_t`; or `uniform_lambda`, evenly over λ = log(α/σ), which suits DPM-Solver++ in few steps. λ is

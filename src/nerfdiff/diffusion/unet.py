@@ -23,10 +23,10 @@ from nerfdiff.diffusion.norm_silu import norm_silu
 from nerfdiff.utils.errors import ConfigError
 
 Context = Sequence[Tensor | KeyValue]
-"""What a U-Net attends to, one entry per attention block: a twin's features, or `UNet.keys_values` of them."""
+"""Features that a U-Net attends to, one entry per attention block: another U-Net's, or `UNet.keys_values` of them."""
 
 AUTO = "auto"
-"""Value of `checkpointing` for whoever trains to settle."""
+"""Value of `checkpointing` that training replaces by what fits the memory."""
 
 
 class Stage(nn.Module):
@@ -75,8 +75,8 @@ class UNet(nn.Module):
             2 lets images of 64 pixels cost about what images of 32 cost with 1. The first resolution is then already
             `patch` times smaller than the input.
         checkpointing: where the image is this many times smaller than the input, or everywhere (true), every stage is
-            recomputed in the backward pass instead of keeping its activations. `auto`, which training settles by the
-            memory there is, is everywhere where nobody settled it.
+            recomputed in the backward pass instead of keeping its activations. `auto`, which training
+            replaces by what fits the memory, is otherwise everywhere.
 
     Raises:
         ConfigError: `checkpointing` names a resolution that the U-Net does not have, or `patch` is below 1.
@@ -152,13 +152,13 @@ class UNet(nn.Module):
         context: Context = (),
         deep: DeepFeatures | None = None,
     ) -> tuple[Float[Tensor, "batch out_channels height width"], list[Tensor]]:
-        """Output image, and the features after every attention block in order: the context of another U-Net.
+        """Return the output image, and the features after every attention block: the context of another U-Net.
 
         Args:
             t: times in [0, 1], if built `with_time`.
             context: another U-Net's features, if built with `cross_attention`, or `keys_values` of them. They may be
                 of fewer scenes: x is then scenes · views images, scene by scene.
-            deep: what deep levels gave at an earlier call, to reuse; features are then those that were computed.
+            deep: outputs of the deep levels at an earlier call, to reuse; features are then those that were computed.
 
         Raises:
             ConfigError: `deep` is to begin below the last resolution, or the image is not made of whole patches.
@@ -183,7 +183,7 @@ class UNet(nn.Module):
             return h
 
         def level(depth: int, h: Tensor) -> Tensor:
-            """All that happens at one resolution and below it: the U is a U within each of its levels."""
+            """Run the U-Net at one resolution and all below it."""
             skips = [h]
             for stage in self._down(depth):
                 h = run(stage, h)
@@ -209,11 +209,11 @@ class UNet(nn.Module):
         return F.pixel_shuffle(self.conv_out(norm_silu(self.norm_out, h)), self.patch), features
 
     def keys_values(self, context: Sequence[Tensor]) -> list[KeyValue]:
-        """What cross-attention looks up in a twin's features: a context of which nothing is left to compute."""
+        """Return the keys and values of another U-Net's features: a context that is computed once for many calls."""
         return [stage.cross.keys_values(features) for stage, features in zip(self._attending(), context, strict=True)]
 
     def _attending(self) -> list[Stage]:
-        """The stages with cross-attention, in the order in which they run."""
+        """Return the stages with cross-attention, in the order in which they run."""
         stages = (module for part in (self.down, self.middle, self.up) for module in part)
         return [stage for stage in stages if isinstance(stage, Stage) and stage.cross is not None]
 
@@ -226,13 +226,13 @@ class UNet(nn.Module):
         return list(self.up)[start : start + self.res_blocks + 1]
 
     def _between(self, level: int) -> tuple[Downsample, Upsample]:
-        """From a level to the next lower one, and back."""
+        """Return the layers from a level to the next lower one, and back."""
         down = self.down[level * (self.res_blocks + 1) + self.res_blocks]
         return down, self.up[(self.levels - 1 - level) * (self.res_blocks + 2) - 1]
 
 
 def levels_to_recompute(checkpointing: bool | str | Sequence[int], levels: int, patch: int = 1) -> frozenset[int]:
-    """Numbers of the U-Net's resolutions, from 0 for the input's, whose activations are not kept.
+    """Return the numbers of the U-Net's resolutions, from 0 for the input's, whose activations are not kept.
 
     Args:
         checkpointing: of all (true, auto), none (false), or those where the image is this many times smaller.

@@ -10,83 +10,68 @@ from torch import Tensor
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.diffusion.deep_features import DeepReuse
-from nerfdiff.diffusion.sampler import make_sampler, sample, time_steps
-from nerfdiff.distill.strategy import Views
+from nerfdiff.diffusion.sampler import SamplerSettings, sample
+from nerfdiff.distill.strategy import PredictedViews
 from nerfdiff.distill.virtual_views import Images, VirtualViews
 from nerfdiff.field.encoder import Encoding
 from nerfdiff.model import NerfDiff
+from nerfdiff.utils.config import from_keys
+from nerfdiff.utils.images import to_unit
 
 
-def sample_views(
-    views: VirtualViews,
-    steps: int,
-    t_max: float,
-    t_min: float,
-    spacing: str,
-    sampler: str,
-    eta: float,
-    deep: DeepReuse | None = None,
-) -> Images:
-    """Each view sampled, conditioned on the single-image NeRF's rendering of it: images in [0, 1]. Not 3D consistent.
+def sample_views(views: VirtualViews, steps: int, sampling: SamplerSettings) -> Images:
+    """Sample each view, conditioned on the single-image NeRF's rendering of it. Views are not 3D consistent.
 
     Args:
         steps: diffusion steps (paper: 64).
-        t_max, t_min: times where sampling starts and ends.
-        spacing: of the times between, `uniform_t` or `uniform_lambda`.
-        sampler: `ddim` or `dpmpp_2m`.
-        eta: DDIM's η; 0 is deterministic given the initial noise.
-        deep: how often the CDM's deep levels are computed; None: at each step.
+
+    Returns:
+        images in [0, 1].
 
     Raises:
-        ConfigError: another sampler or spacing, or times or an eta that cannot be.
+        ConfigError: a sampler, spacing, times or eta that cannot be.
     """
-    times = time_steps(steps, t_max, t_min, spacing, device=views.encoding.source.device)
-    run, kept = make_sampler(sampler, eta), views.reusing(deep)
-    x0 = sample(lambda z, t: views.denoise(z, t.expand(len(z)), deep=kept), views.noise(), times, run, views.noise)
-    return 0.5 * (x0 + 1)
+    times, sampler = sampling.times(steps, views.encoding.source.device), sampling.begin()
+    deep = views.deep_features(sampling.deep)
+    x0 = sample(lambda z, t: views.denoise(z, t.expand(len(z)), deep=deep), views.noise(), times, sampler, views.noise)
+    return to_unit(x0)
 
 
+@from_keys(sampling=SamplerSettings)
 @dataclass(frozen=True)
-class IndependentViews:
-    """The views to predict, as `sample_views` makes them.
+class CDMSampling:
+    """Predict views as `sample_views` makes them.
 
     Args:
-        steps, t_max, t_min, spacing, sampler, eta, deep: as there.
+        steps: diffusion steps.
         views_at_once: views denoised in one batch, which bounds memory.
     """
 
     name: str
     steps: int
-    t_max: float
-    t_min: float
-    spacing: str
-    sampler: str
-    eta: float
+    sampling: SamplerSettings
     views_at_once: int
-    deep: DeepReuse | None = None
 
     @torch.no_grad()
     def predict(
         self, model: NerfDiff, scenes: Sequence[ViewBatch], seed: int, callbacks: Sequence[Callback] = ()
-    ) -> list[Views]:
+    ) -> list[PredictedViews]:
+        """See `Strategy`."""
         predicted = []
         for scene in scenes:
-            encoding = model.encode(scene.source, scene.source_cameras, scene.near, scene.far)
-            images = self.sample(model, encoding, scene.target_cameras, (seed, "cdm", *scene.scene_ids))[0]
+            images = self.sample(model, model.encode(scene), scene.target_cameras, (seed, "cdm", *scene.scene_ids))[0]
             rendered = model.renderer.samples_per_ray * images[:, 0].numel()  # the CDM's condition
-            predicted.append(Views(images, denoiser_calls=self.steps * len(images), field_queries=rendered))
+            predicted.append(PredictedViews(images, denoiser_calls=self.steps * len(images), field_queries=rendered))
         return predicted
 
     @torch.no_grad()
     def sample(
         self, model: NerfDiff, encoding: Encoding, cameras: Cameras, seed: tuple[int | str, ...]
     ) -> Float[Tensor, "1 views 3 height width"]:
-        """Images in [0, 1] of `cameras` [1, views], given in the input camera's space.
+        """Sample images in [0, 1] of `cameras` [1, views], given in the input camera's space.
 
         Args:
             seed: a view's noise depends on it and on the view's position, not on what is sampled beside it.
         """
         views = VirtualViews(model, encoding, cameras, self.views_at_once, seed)
-        how = self.steps, self.t_max, self.t_min, self.spacing, self.sampler, self.eta, self.deep
-        return sample_views(views, *how)[None]
+        return sample_views(views, self.steps, self.sampling)[None]

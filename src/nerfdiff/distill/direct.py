@@ -1,12 +1,13 @@
-"""Direct distillation: every view sampled once by itself, and the field fitted to what came out (paper, appendix)."""
+"""Direct distillation: sample every view once by itself, and fit the field to the samples (paper, appendix)."""
 
-from nerfdiff.diffusion.deep_features import DeepReuse
+from nerfdiff.diffusion.sampler import SamplerSettings
 from nerfdiff.distill.cdm import sample_views
 from nerfdiff.distill.virtual_views import Images, VirtualViews
+from nerfdiff.utils.config import from_keys
 
 
-class FixedImages:
-    """The same images at every step.
+class FixedTeacher:
+    """Give the same images at every step.
 
     Args:
         images: in [0, 1], one per virtual view.
@@ -23,26 +24,16 @@ class FixedImages:
         return self.images
 
 
-class SampledViews(FixedImages):
-    """Samples of the CDM.
+@from_keys(sampling=SamplerSettings)
+class DirectTeacher(FixedTeacher):
+    """Give samples of the CDM.
 
     Args:
         views: to sample.
-        steps: how many times targets are asked for, to fit as long as the other methods do.
-        sampler_steps: diffusion steps from `t_max` to `t_min`.
-        spacing, sampler, eta, deep: as for `sample_views`.
+        steps: see `FixedTeacher`.
+        sampler_steps: diffusion steps.
+        sampling: see `sample_views`.
     """
 
-    def __init__(
-        self,
-        views: VirtualViews,
-        steps: int,
-        sampler_steps: int,
-        t_max: float,
-        t_min: float,
-        spacing: str,
-        sampler: str,
-        eta: float,
-        deep: DeepReuse | None = None,
-    ):
-        super().__init__(sample_views(views, sampler_steps, t_max, t_min, spacing, sampler, eta, deep), steps)
+    def __init__(self, views: VirtualViews, steps: int, sampler_steps: int, sampling: SamplerSettings):
+        super().__init__(sample_views(views, sampler_steps, sampling), steps)

@@ -1,6 +1,5 @@
 """Test-time fine-tuning of scenes' fields with the frozen CDM (paper, "Fine-tuning Phase")."""
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -15,50 +14,30 @@ from nerfdiff.distill.virtual_views import VirtualViews
 from nerfdiff.fit.inner_steps import InnerSteps
 from nerfdiff.fit.ray_batches import RayBatches
 from nerfdiff.fit.refined_field import RefinedField, choose
+from nerfdiff.fit.settings import DECAYS, FitSettings
 from nerfdiff.metrics.image import psnr_of_mse
 from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.randomness import generator
 from nerfdiff.utils.timing import timed
 
-DECAYS = {
-    "none": lambda done: 1.0,
-    "linear": lambda done: 1 - done,
-    "cosine": lambda done: 0.5 * (1 + math.cos(math.pi * done)),
-}
-"""Factors of the learning rates, by the share of the teacher's steps that are done."""
-
-LOOKS = ("every_step", "refresh")
-"""When coarse weights are found anew."""
-
 SceneImages = Float[Tensor, "scenes views 3 height width"]
 
 
 class NGDModule(LightningModule):
-    """At every step: ask the teachers for images of all views, then fit the fields to them.
+    """Fit fields to their teachers' images of all views, step by step.
 
     The CDM and the encoder are no part of this module: what is saved, moved and counted is the fields. Scenes share
-    nothing but the device's time: each has its own views, teacher, noise, parameters, loss and end.
+    nothing but the device's time: each has its own views, teacher, noise, parameters, loss and status.
 
     Args:
         field: the single-image NeRFs to start from, of one or several scenes.
         views: the virtual views of each scene, as many for all.
         teachers: of each scene's target images; `ngd`, `direct`, `sds` and `stochastic` differ in nothing else.
-        inner_steps: N, Adam steps after each of the teacher's.
-        rays: B, per inner step and scene.
-        lr_planes, lr_decoder: learning rates of W and θ.
-        lr_decay: of both, over the teacher's steps: `none`, `linear` or `cosine`.
-        fit_source: whether the input image, the one view that is known, is fitted beside the virtual views.
-        target_tolerance, source_tolerance: dB by which the last targets and the input view may be explained worse
-            before a scene falls back to its first field.
-        coarse: when the weights are found from which importance samples are drawn: at `every_step` of the inner ones,
-            or at each `refresh`, when the field is rendered for the teacher anyway: inner steps then look at all their
-            samples at once. These take 2 bytes for each bin of each ray of all views. Where teachers do not follow the
-            field, nothing is rendered between inner steps, and weights are found at every step.
-        cuda_graphs: record an inner step once and replay it, on a GPU.
+        fit: the inner steps' settings.
         seeds: of each scene's rays.
 
     Raises:
-        ConfigError: another `lr_decay` or `coarse`, no rays, negative steps, or scenes with different numbers of views.
+        ConfigError: scenes with different numbers of views.
     """
 
     def __init__(
@@ -66,40 +45,19 @@ class NGDModule(LightningModule):
         field: RefinedField,
         views: Sequence[VirtualViews],
         teachers: Sequence[Teacher],
-        inner_steps: int,
-        rays: int,
-        lr_planes: float,
-        lr_decoder: float,
-        lr_decay: str,
-        fit_source: bool,
-        target_tolerance: float,
-        source_tolerance: float,
-        coarse: str,
-        cuda_graphs: bool,
+        fit: FitSettings,
         seeds: Sequence[tuple[int | str, ...]],
     ):
         super().__init__()
         self.automatic_optimization = False
         self.field = field
-        self.views, self.teachers = views, teachers
-        self.inner_steps, self.rays = inner_steps, rays
-        if rays < 1 or inner_steps < 0:
-            raise ConfigError(f"rays={rays} must be at least 1 and inner_steps={inner_steps} at least 0")
-        if lr_decay not in DECAYS:
-            raise ConfigError(f"strategy.lr_decay={lr_decay!r}: choose {', '.join(DECAYS)}")
-        if coarse not in LOOKS:
-            raise ConfigError(f"strategy.coarse={coarse!r}: choose {', '.join(LOOKS)}")
+        self.views, self.teachers, self.settings, self.seeds = views, teachers, fit, seeds
         if len({len(v) for v in views}) > 1:
             raise ConfigError(
                 f"scenes with {sorted({len(v) for v in views})} virtual views cannot be distilled together: "
                 "set scenes_at_once=1"
             )
-        self.lr_planes, self.lr_decoder, self.lr_decay = lr_planes, lr_decoder, lr_decay
-        self.fit_source = fit_source
-        self.tolerances = target_tolerance, source_tolerance
-        self.keeps_coarse = coarse == "refresh" and teachers[0].follows_field and inner_steps > 0
-        self.cuda_graphs = cuda_graphs
-        self.seeds = seeds
+        self.keeps_coarse = fit.coarse == "refresh" and teachers[0].follows_field and fit.inner_steps > 0
         self.statuses = ["ok"] * len(field)
         self.cameras = Cameras.join([v.cameras for v in views])
         self._source = torch.cat([v.encoding.source for v in views])
@@ -107,22 +65,22 @@ class NGDModule(LightningModule):
 
     @property
     def steps(self) -> int:
-        """How many times the teachers are asked."""
+        """Number of times the teachers are asked for targets."""
         return self.teachers[0].steps
 
     def train_dataloader(self) -> range:
-        """The teachers' steps."""
+        """Return the teachers' steps."""
         return range(self.steps)
 
     def configure_optimizers(self) -> tuple[list, list]:
         # The rates are tensors so that a recorded step reads what they are when it is replayed.
-        rates = torch.tensor([self.lr_planes, self.lr_decoder], device=self.device)
+        rates = torch.tensor([self.settings.lr_planes, self.settings.lr_decoder], device=self.device)
         groups = [
             {"params": [self.field.planes], "lr": rates[0]},
             {"params": list(self.field.decoder.parameters()), "lr": rates[1]},
         ]
         optimizer = torch.optim.Adam(groups, fused=True, capturable=self.device.type == "cuda")
-        decay, steps = DECAYS[self.lr_decay], self.steps
+        decay, steps = DECAYS[self.settings.lr_decay], self.steps
         return [optimizer], [torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: decay(step / steps))]
 
     def on_train_start(self) -> None:
@@ -131,7 +89,7 @@ class NGDModule(LightningModule):
         self._finite = torch.ones(len(self.field), dtype=torch.bool, device=self.device)
         self._finite_on_host = torch.ones(len(self.field), dtype=torch.bool, pin_memory=self.device.type == "cuda")
         self._fitted = self.cameras
-        if self.fit_source:
+        if self.settings.fit_source:
             both = zip(self.cameras, self.field.cameras, strict=True)
             self._fitted = Cameras.stack([Cameras.join([views, source[None]]) for views, source in both])
         self._batches = RayBatches(self._fitted, self.field.near, self.field.far)
@@ -140,58 +98,62 @@ class NGDModule(LightningModule):
             self.views[0].model.renderer,
             self._batches,
             self.optimizers().optimizer,
-            self.rays,
+            self.settings.rays,
             [generator(self.device, *seed, "rays") for seed in self.seeds],
-            self.cuda_graphs,
+            self.settings.cuda_graphs,
         )
 
     def on_train_batch_start(self, step: int, batch_idx: int) -> int | None:
-        """Ends the run (-1) when every scene is lost."""
+        """End the run (-1) when every scene's parameters are non-finite."""
         self._alive = self._finite_on_host.tolist()
         return None if any(self._alive) else -1
 
     def training_step(self, step: int, batch_idx: int) -> None:
+        # render the field, for the teachers to guide by
         with timed("guide"):
-            rendered = self._guidance() if self.teachers[0].follows_field else None
+            rendered = self._render_guidance() if self.teachers[0].follows_field else None
+        # ask the teachers for targets: the guided, denoised images
         targets = torch.stack(
             [
                 teacher.targets(step, None if rendered is None else rendered[scene])
                 if self._alive[scene]
-                else self._last_targets[scene]  # the teacher of a lost scene rests
+                else self._last_targets[scene]  # a scene that failed asks its teacher no more
                 for scene, teacher in enumerate(self.teachers)
             ]
         )
+        # fit the field to them
         losses = self._fit(targets)
+        # record, and keep the last finite field
         first, last = (losses[0], losses[-1]) if len(losses) else (None, None)
         distance = first if rendered is None else _mse(rendered, targets)
         one = self.teachers[self._alive.index(True)]
         self._records.append((one.t, one.weight, first, last, distance))
-        self._keep_what_is_good(losses, targets)
+        self._keep_finite(losses, targets)
 
     def on_train_end(self) -> None:
-        """Back to the last finite field, or if it has been harmed to the one it began as.
+        """Restore each scene's last finite field, or, where the fit made it worse, the field it began as.
 
-        It has been if it explains the last targets worse than the one it began as (not by little: they may want what
-        a blurred field gives up), or, as they may have followed it astray, the input view much worse. What was finite
-        before it failed is no exception.
+        It is worse if it explains the last targets worse than the first field by more than `target_tolerance` (a little
+        is allowed: the targets may have details that a blurred field gives up), or, as the targets may have followed
+        the field astray, the input view by more than `source_tolerance`. This holds for a last finite field too.
         """
         self.field.restore(self._good, ~self._finite)
-        harmed = torch.zeros_like(self._finite)
-        if self.inner_steps > 0:
+        worse = torch.zeros_like(self._finite)
+        if self.settings.inner_steps > 0:
             refined, after = self._distances(), self.field.snapshot()
-            self.field.restore(self._start, ~harmed)
-            began = self._distances()
+            self.field.restore(self._start, ~worse)
+            tolerances = self.settings.target_tolerance, self.settings.source_tolerance
             of_targets, of_source = (
-                10 ** (dB / 10) * was + 1e-6 for dB, was in zip(self.tolerances, began, strict=True)
+                10 ** (dB / 10) * first + 1e-6 for dB, first in zip(tolerances, self._distances(), strict=True)
             )
-            harmed = ~((refined[0] <= of_targets) & (refined[1] <= of_source))
-            self.field.restore(after, ~harmed)
-        for scene, (finite, worse) in enumerate(zip(self._finite.tolist(), harmed.tolist(), strict=True)):
-            self.statuses[scene] = "non-finite" if not finite else "diverged" if worse else "ok"
-        del self._inner, self._batches  # module and Trainer hold each other; what they need most of must not wait
+            worse = ~((refined[0] <= of_targets) & (refined[1] <= of_source))
+            self.field.restore(after, ~worse)
+        for scene, (finite, diverged) in enumerate(zip(self._finite.tolist(), worse.tolist(), strict=True)):
+            self.statuses[scene] = "non-finite" if not finite else "diverged" if diverged else "ok"
+        del self._inner, self._batches  # module and Trainer hold each other: free the largest tensors now
 
     def trace(self, scene: int) -> list[Step]:
-        """What happened, step by step. Waits for the device."""
+        """Return one scene's record, step by step. Waits for the device."""
 
         def number(values: Tensor | None) -> float | None:
             return None if values is None else float(values[scene])
@@ -202,24 +164,26 @@ class NGDModule(LightningModule):
         ]
 
     def progress(self) -> tuple[float | None, float | None]:
-        """t of the last step and the mean agreement of renderings and targets, in dB. Waits for the device."""
+        """Return t of the last step and the mean PSNR of renderings against targets, in dB. Waits for the device."""
         t, *_, distance = self._records[-1]
         return t, None if distance is None else float(psnr_of_mse(distance.nanmean()))
 
     @timed("fit")
     def _fit(self, targets: SceneImages) -> Float[Tensor, "steps scenes"]:
-        """N inner steps; their losses."""
-        if self.inner_steps == 0:
+        """Take N inner steps; return their losses."""
+        steps = self.settings.inner_steps
+        if steps == 0:
             return targets.new_zeros(0, len(targets))
-        self._batches.paint(torch.cat([targets, self._source[:, None]], 1) if self.fit_source else targets)
-        losses = self._inner.run(self.inner_steps)
+        both = torch.cat([targets, self._source[:, None]], 1) if self.settings.fit_source else targets
+        self._batches.set_colours(both)
+        losses = self._inner.run(steps)
         self.lr_schedulers().step()
         for views in self.views:
-            views.field_queries += self.inner_steps * self._inner.queries
+            views.field_queries += steps * self._inner.queries
         return losses
 
-    def _keep_what_is_good(self, losses: Float[Tensor, "steps scenes"], targets: SceneImages) -> None:
-        """Note which scenes are well, on the device: nobody waits to hear it. One that is not stays lost."""
+    def _keep_finite(self, losses: Float[Tensor, "steps scenes"], targets: SceneImages) -> None:
+        """Keep the fields of scenes that are still finite, without waiting for the device. Others stay as they were."""
         self._finite &= torch.isfinite(losses).all(0) & self.field.finite() & torch.isfinite(targets).flatten(1).all(1)
         self._finite_on_host.copy_(
             self._finite, non_blocking=True
@@ -230,25 +194,24 @@ class NGDModule(LightningModule):
         self._last_targets = torch.where(keep, targets, self._last_targets)
         self._good = choose(self._finite, self.field.snapshot(), self._good)
 
-    def _guidance(self) -> SceneImages:
-        """The virtual views' renderings. Where coarse weights are kept, the input view is looked at too if fitted."""
+    def _render_guidance(self) -> SceneImages:
+        """Render the virtual views. Where coarse weights are kept, the input view is rendered too if fitted."""
         if not self.keeps_coarse:
             return self._render(self.cameras)
-        return self._render(self._fitted, remember=True)[:, : self.cameras.shape[1]]
+        return self._render(self._fitted, keep_coarse=True)[:, : self.cameras.shape[1]]
 
     @torch.no_grad()
-    def _render(self, cameras: Cameras, remember: bool = False) -> SceneImages:
+    def _render(self, cameras: Cameras, keep_coarse: bool = False) -> SceneImages:
         renderer = self.views[0].model.renderer
-        rendering = self.field.render(renderer, cameras, keep_coarse=remember)
+        rendering = self.field.render(renderer, cameras, keep_coarse)
         if rendering.coarse is not None:
-            self._batches.remember(rendering.coarse)
-        images = rendering.rgb.movedim(-1, 2)
+            self._batches.set_coarse(rendering.coarse)
         for views in self.views:
-            views.field_queries += renderer.samples_per_ray * images[0, :, 0].numel()
-        return images
+            views.field_queries += renderer.samples_per_ray * rendering.opacity[0].numel()
+        return rendering.images
 
     def _distances(self) -> tuple[Float[Tensor, "scenes"], Float[Tensor, "scenes"]]:
-        """Mean squared errors of the last targets and of the input view."""
+        """Return the mean squared errors of the last targets and of the input view."""
         source = self._render(self.field.cameras[:, None])
         return _mse(self._render(self.cameras), self._last_targets), _mse(source[:, 0], self._source)
 

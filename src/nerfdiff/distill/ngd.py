@@ -1,4 +1,5 @@
-"""NeRF-guided distillation: all views follow the reverse process together, drawn towards the field (Algorithm 1)."""
+"""NeRF-guided distillation (NerfDiff, arXiv 2302.10109, Algorithm 1): all views follow the reverse process together,
+each denoised image drawn towards the field's rendering of it."""
 
 from dataclasses import dataclass
 
@@ -6,12 +7,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfdiff.diffusion.deep_features import DeepReuse
-from nerfdiff.diffusion.sampler import make_sampler, time_steps
+from nerfdiff.diffusion.sampler import SamplerSettings
 from nerfdiff.diffusion.schedule import add_noise, alpha_sigma
-from nerfdiff.distill.teacher import sees_current
+from nerfdiff.distill.teacher import uses_current_rendering
 from nerfdiff.distill.virtual_views import Images, VirtualViews
+from nerfdiff.utils.config import from_keys
 from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.images import to_signed, to_unit
 
 SCHEDULES = ("snr", "constant", "linear")
 COMPARISONS = ("current", "last")
@@ -48,7 +50,7 @@ class Guidance:
             raise ConfigError(f"guidance.gamma={self.gamma} must be at least 0")
 
     def weight(self, t: Float[Tensor, ""]) -> Float[Tensor, ""]:
-        """w in [0, 1], finite at both ends."""
+        """Return w in [0, 1] at time t; finite at both ends."""
         if self.schedule == "snr":
             alpha, sigma = alpha_sigma(t)
             # γσ² / α² without dividing by zero: at t = 1 any γ > 0 reaches the clamp
@@ -63,62 +65,58 @@ class Guidance:
         last: Float[Tensor, "views 3 height width"],
         t: Float[Tensor, ""],
     ) -> Float[Tensor, "views 3 height width"]:
-        """The guided images x̃0; all in [-1, 1], which a difference to the last step's image could leave."""
+        """Guide denoised images.
+
+        Args:
+            x0, rendered, last: the denoised images, the field's renderings and the last step's x̃0, all in [-1, 1].
+
+        Returns:
+            x̃0, clamped to [-1, 1], which a difference to the last step's image could leave.
+        """
         compared = x0 if self.compare == "current" else last
         return (x0 - self.weight(t) * (compared - rendered)).clamp(-1, 1)
 
 
-class GuidedViews:
-    """One step of every view, guided, each time targets are asked for.
+@from_keys(sampling=SamplerSettings)
+class NGDTeacher:
+    """Take one guided step of the reverse process for every view, each time targets are asked for.
 
     Args:
-        views: to follow.
-        steps: diffusion steps from `t_max` to `t_min` (paper: 64).
-        spacing: of the times, `uniform_t` or `uniform_lambda`.
-        sampler: `ddim` or `dpmpp_2m`; the guided images take the place of the denoised ones in either.
-        eta: DDIM's η.
+        views: to sample.
+        steps: diffusion steps (paper: 64).
+        sampling: the guided images take the place of the denoised ones in any sampler.
         guidance: towards the field's renderings.
-        condition: the rendering that the CDM sees: the `first`, of the single-image NeRF, or the `current` one.
-        deep: how often the CDM's deep levels are computed; None: at each step.
+        condition: the rendering that conditions the CDM: the `first`, of the single-image NeRF, or the `current` one.
 
     Raises:
-        ConfigError: another `condition`, sampler or spacing, or times or an eta that cannot be.
+        ConfigError: another `condition`, or a sampler, spacing, times or eta that cannot be.
     """
 
     follows_field = True
 
-    def __init__(
-        self,
-        views: VirtualViews,
-        steps: int,
-        t_max: float,
-        t_min: float,
-        spacing: str,
-        sampler: str,
-        eta: float,
-        guidance: Guidance,
-        condition: str,
-        deep: DeepReuse | None = None,
-    ):
+    def __init__(self, views: VirtualViews, steps: int, sampling: SamplerSettings, guidance: Guidance, condition: str):
         self.views, self.steps, self.guidance = views, steps, guidance
-        self.sampler, self._deep = make_sampler(sampler, eta), views.reusing(deep)
-        self.on_current = sees_current(condition)
+        self.sampler, self._deep = sampling.begin(), views.deep_features(sampling.deep)
+        self.on_current = uses_current_rendering(condition)
         # what is recorded of a step is computed on the host, where nothing waits for the device
-        self._host_times = time_steps(steps, t_max, t_min, spacing)
+        self._host_times = sampling.times(steps)
         self.times = self._host_times.to(views.encoding.source.device)
         self.t: float | None = None
         self.weight: float | None = None
-        self._last = 2 * views.first_renderings - 1
+        self._last = to_signed(views.first_renderings)
         # Algorithm 1 begins with the renderings, noised: for t_max = 1 that is noise alone
         self._z = add_noise(self._last, views.noise(), *alpha_sigma(self.times[0]))
 
     def targets(self, step: int, rendered: Images) -> Images:
         t, t_next = self.times[step], self.times[step + 1]
+        # denoise
         condition = rendered if self.on_current else None
         x0 = self.views.denoise(self._z, t.expand(len(self._z)), condition, self._deep)
-        self._last = self.guidance(x0, 2 * rendered - 1, self._last, t)
+        # guide
+        self._last = self.guidance(x0, to_signed(rendered), self._last, t)
         recorded = self._host_times[step]
         self.t, self.weight = float(recorded), float(self.guidance.weight(recorded))
+        # step to the next time
         noise = self.views.noise() if self.sampler.needs_noise else None
         self._z = self.sampler.step(self._z, self._last, t, t_next, noise)
-        return 0.5 * (self._last + 1)
+        return to_unit(self._last)

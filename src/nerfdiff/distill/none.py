@@ -7,7 +7,7 @@ import torch
 from lightning import Callback
 
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.distill.strategy import Views
+from nerfdiff.distill.strategy import PredictedViews
 from nerfdiff.field.kinds import TRIPLANE
 from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.fit.saved_field import SavedField
@@ -24,15 +24,15 @@ class SingleImageNeRF:
     @torch.no_grad()
     def predict(
         self, model: NerfDiff, scenes: Sequence[ViewBatch], seed: int, callbacks: Sequence[Callback] = ()
-    ) -> list[Views]:
+    ) -> list[PredictedViews]:
         predicted = []
         for scene in scenes:
-            encoding = model.encode(scene.source, scene.source_cameras, scene.near, scene.far)
+            encoding = model.encode(scene)
             if model.field_name == TRIPLANE:
                 field = RefinedField(encoding.triplane, model.decoder)
-                predicted.append(Views.of_field(SavedField(field, model.renderer), scene.target_cameras))
+                predicted.append(PredictedViews.of_field(SavedField(field, model.renderer), scene.target_cameras))
             else:  # nothing there that could be kept without the model
                 with timed("render"):
                     rendering = model.render(encoding, scene.target_cameras)
-                predicted.append(Views.of_rendering(rendering, model.renderer, scene.target_cameras))
+                predicted.append(PredictedViews.of_rendering(rendering, model.renderer, scene.target_cameras))
         return predicted

@@ -1,4 +1,4 @@
-"""Π: the cameras, relative to the input's, from which a scene is to be seen (paper, appendix, "Prior")."""
+"""Π: the virtual views' cameras, relative to the input camera (paper, appendix, "Prior")."""
 
 import logging
 import math
@@ -18,35 +18,33 @@ from nerfdiff.trajectories import look_at, look_at_point
 from nerfdiff.utils.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
-IN_SIGHT = 0.9
-"""Least cosine between the input camera's axis and the direction of what all look at."""
 
 
 @runtime_checkable
 class Prior(Protocol):
-    """Virtual cameras of a scene.
+    """Place the virtual cameras of a scene.
 
-    Nothing else is read of a prior: rows record the name of its class, and as K how many cameras the scenes got.
+    The call is all that is asked of a prior: rows of results record its class's name, and as K the number of cameras.
     """
 
     def __call__(self, scene: ViewBatch) -> Cameras:
-        """Cameras [1, K] in the input camera's space, with the input's intrinsics; `scene` is a batch of one."""
+        """Return cameras [1, K] in the input camera's space, with the input's intrinsics, for a batch of one scene."""
 
 
 def with_source_lens(c2w: Float[Tensor, "views 4 4"], scene: ViewBatch) -> Cameras:
-    """Cameras [1, views] with the input's intrinsics and image size."""
+    """Return cameras [1, views] with the input's intrinsics and image size."""
     own = scene.source_cameras
     return Cameras(c2w[None].to(own.K), own.K[:1, None].expand(1, len(c2w), 3, 3), own.height, own.width)
 
 
 def all_cameras(scene: ViewBatch) -> Cameras:
-    """The input camera, which is the identity, and after it the scene's others: [views]."""
+    """Return the cameras [views] of a scene: the input camera (the identity), then the target cameras."""
     return Cameras.join([scene.source_cameras, scene.target_cameras[0]])
 
 
 @dataclass(frozen=True)
 class Circle:
-    """Cameras on the circle through the scene's, looking at what they look at (paper, appendix, "Clevr3D").
+    """Place cameras on the circle through the scene's, with the same look-at point (paper, appendix, "Clevr3D").
 
     All in the input camera's space: the look-at point is the intersection of the optical axes; up is the normal of
     the plane that holds the cameras, on the side from which they look down; the circle lies in that plane around the
@@ -72,7 +70,7 @@ class Circle:
 
 
 def plane_normal(cameras: Cameras) -> Float[Tensor, "3"]:
-    """The unit normal of the plane through the cameras' centres, on the side from which they look down.
+    """Return the unit normal of the plane through the cameras' centres, on the side from which they look down.
 
     Raises:
         DataError: fewer than three cameras, or all in one line.
@@ -90,8 +88,8 @@ def plane_normal(cameras: Cameras) -> Float[Tensor, "3"]:
 
 
 @dataclass(frozen=True)
-class OwnViews:
-    """The input camera and those of the views to predict, spread evenly if there are more than K.
+class SceneCameras:
+    """Take the input camera and those of the views to predict, spread evenly if there are more than K.
 
     Of these views nothing but the poses is used, which ABO's renders share among all objects. Where there are fewer
     than K, as with `data.eval_stride` above 1, a log line says so once.
@@ -122,7 +120,7 @@ def _warn_of_fewer(there: int, asked: int) -> None:
 
 @dataclass(frozen=True)
 class Sphere:
-    """Cameras spread evenly (a Fibonacci lattice) over a band of the sphere around the middle of the scene.
+    """Spread cameras evenly (a Fibonacci lattice) over a band of the sphere around the middle of the scene.
 
     The middle is on the input camera's axis, half way between near and far; up is the input camera's, tilted by the
     elevation from which it is assumed to look.
@@ -172,28 +170,31 @@ class Sphere:
 
 @dataclass(frozen=True)
 class SRNSpiral:
-    """Evenly chosen cameras of SRN's test spiral, relative to its view `source_view`: no pose file is needed.
+    """Choose cameras of SRN's test spiral evenly, relative to its view `source_view`, without a pose file.
 
     Args:
         views: K; 50 takes every fifth of the 251 views (paper).
         source_view: the view that the input image is.
         radius: of the spiral; None: the input camera's distance from what the scene's cameras look at, which is 1.3
             for SRN's cars and 2 for its chairs.
+        min_cosine: between the input camera's axis and the direction of that point, for a radius to be found.
 
     Raises:
-        ConfigError: more views than the spiral has, none, or a source view or radius that it cannot have.
+        ConfigError: more views than the spiral has, none, or a source view, radius or cosine that it cannot have.
         DataError: there is no radius, and the scene has no second camera to find it by.
     """
 
     views: int
     source_view: int
     radius: float | None
+    min_cosine: float
 
     def __post_init__(self):
         for key, possible, expected in (
             ("views", 1 <= self.views <= SPIRAL_VIEWS, f"1 to {SPIRAL_VIEWS}, the spiral's views"),
             ("source_view", 0 <= self.source_view < SPIRAL_VIEWS, f"one of the spiral's, 0 to {SPIRAL_VIEWS - 1}"),
             ("radius", self.radius is None or self.radius > 0, "a positive distance in scene units, or null"),
+            ("min_cosine", 0 <= self.min_cosine < 1, "from 0 to less than 1"),
         ):
             if not possible:
                 raise ConfigError(f"prior.{key}={getattr(self, key)}: expected {expected}")
@@ -207,7 +208,7 @@ class SRNSpiral:
     def _radius(self, scene: ViewBatch) -> float:
         point = look_at_point(all_cameras(scene))
         radius = float(point.norm())  # the input camera stands at the origin, and looks along z
-        if not float(point[2]) > IN_SIGHT * radius > 0:
+        if not float(point[2]) > self.min_cosine * radius:
             raise DataError(
                 "prior=srn_spiral takes its radius from what the scene's cameras look at, but scene "
                 f"{scene.scene_ids[0]} has no second camera that looks at the same point as its input camera; set "

@@ -1,4 +1,4 @@
-"""What a test-time method is: one input image and a trained model to images of other views."""
+"""Test-time methods: from one input image and a trained model to images of other views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,13 +15,13 @@ from nerfdiff.distill.trace import Step
 from nerfdiff.fit.saved_field import SavedField
 from nerfdiff.metrics.depth import z_depth
 from nerfdiff.model import NerfDiff
-from nerfdiff.render.renderer import Renderer, Rendering
+from nerfdiff.render.renderer import RenderedViews, Renderer
 from nerfdiff.utils.timing import timed
 
 
 @dataclass(frozen=True)
-class Views:
-    """Predicted images of one scene's target views, and what they cost to make.
+class PredictedViews:
+    """Predicted images of one scene's target views, and their cost.
 
     Args:
         images: colours in [0, 1].
@@ -30,7 +30,7 @@ class Views:
         denoiser_calls: images passed through the CDM.
         field_queries: points at which a field was evaluated.
         virtual_views: K, how many views a field was fitted to, where it was.
-        field: what the images are renderings of, where the method has a field.
+        field: the field that the images are rendered from, where the method has one.
         trace: of its fitting, where it was fitted.
         status: `ok`, or why the field is not the one that the method ended with.
     """
@@ -55,14 +55,14 @@ class Views:
         field_queries: int = 0,
         trace: Sequence[Step] = (),
         status: str = "ok",
-    ) -> "Views":
-        """What a field shows to cameras [1, views].
+    ) -> "PredictedViews":
+        """Render a field from cameras [1, views].
 
         Args:
-            denoiser_calls, field_queries: what it took to make the field; rendering is added here.
+            denoiser_calls, field_queries: spent on the field before; rendering is added here.
         """
         rendering = saved.field.render(saved.renderer, cameras)
-        views = Views.of_rendering(rendering, saved.renderer, cameras)
+        views = PredictedViews.of_rendering(rendering, saved.renderer, cameras)
         return replace(
             views,
             denoiser_calls=denoiser_calls,
@@ -73,10 +73,10 @@ class Views:
         )
 
     @staticmethod
-    def of_rendering(rendering: Rendering, renderer: Renderer, cameras: Cameras) -> "Views":
-        """What `renderer` made of a field that is not kept, of leading shape [1, views, height, width]."""
-        return Views(
-            images=rendering.rgb[0].movedim(-1, 1),
+    def of_rendering(rendering: RenderedViews, renderer: Renderer, cameras: Cameras) -> "PredictedViews":
+        """Take the images, opacity and z-depth of a rendering of cameras [1, views]; no field is kept."""
+        return PredictedViews(
+            images=rendering.images[0],
             opacity=rendering.opacity[0],
             depth=z_depth(rendering.depth[0], cameras[0]),
             field_queries=renderer.samples_per_ray * rendering.opacity.numel(),
@@ -91,8 +91,8 @@ class Strategy(Protocol):
 
     def predict(
         self, model: NerfDiff | None, scenes: Sequence[ViewBatch], seed: int, callbacks: Sequence[Callback] = ()
-    ) -> list[Views]:
-        """Images of every target view of each of `scenes`, from its source view alone, whatever the other scenes.
+    ) -> list[PredictedViews]:
+        """Predict every target view of each scene from its source view alone, independently of the other scenes.
 
         Args:
             model: frozen; baselines that use none take None.

@@ -1,4 +1,4 @@
-"""Where methods differ: what images the field is fitted to at each step."""
+"""Teachers: the target images that the field is fitted to at each step. Methods differ in nothing else."""
 
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
@@ -9,22 +9,22 @@ from nerfdiff.utils.errors import ConfigError
 
 @runtime_checkable
 class Teacher(Protocol):
-    """A run of target images for all virtual views."""
+    """Give target images of all virtual views, step by step."""
 
     steps: int
-    """How many times targets are asked for."""
+    """Number of times targets are asked for."""
 
     follows_field: bool
-    """Whether targets depend on the field's renderings, which are made for that only."""
+    """True if targets depend on the field's renderings, which are made for that only."""
 
     t: float | None
     """Time of the last step, where all views share one."""
 
     weight: float | None
-    """Of guidance at the last step, where there is one."""
+    """Weight of guidance at the last step, where there is one."""
 
     def targets(self, step: int, rendered: Images | None) -> Images:
-        """Images in [0, 1] to fit the field to.
+        """Return images in [0, 1] to fit the field to.
 
         Args:
             step: from 0 to `steps` - 1, each once, in order.
@@ -35,8 +35,8 @@ class Teacher(Protocol):
 MakeTeacher = Callable[[VirtualViews], Teacher]
 
 
-def sees_current(condition: str) -> bool:
-    """Whether the CDM is conditioned on the field's `current` rendering, rather than on the `first`.
+def uses_current_rendering(condition: str) -> bool:
+    """Return true for `current`: the CDM is conditioned on the field's current rendering, else on the `first`.
 
     Raises:
         ConfigError: neither of them.

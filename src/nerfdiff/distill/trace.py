@@ -1,4 +1,4 @@
-"""What happened while a field was fitted, step by step."""
+"""The record of a field's fit, step by step."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
@@ -13,7 +13,7 @@ PLOT = "trace.png"
 
 @dataclass(frozen=True)
 class Step:
-    """One line of the trace.
+    """Record one step of the teacher.
 
     Args:
         t: diffusion time, where all views share one.
@@ -31,13 +31,13 @@ class Step:
 
 
 def write_trace(path: Path, trace: Sequence[Step]) -> None:
-    """One row per step, atomically; what a method has not is an empty cell."""
+    """Write one row per step, atomically; values that a method does not have are empty cells."""
     rows = [{"step": number} | asdict(step) for number, step in enumerate(trace)]
     write_csv(path, ["step", *(field.name for field in fields(Step))], rows)
 
 
 def plot_trace(path: Path, trace: Sequence[Step]) -> None:
-    """Losses, weight and agreement over the steps, as a picture."""
+    """Plot losses, weight and agreement over the steps."""
     from matplotlib.figure import Figure  # not pyplot: no global state, and no display
 
     figure = Figure(figsize=(9, 2.6), layout="constrained")

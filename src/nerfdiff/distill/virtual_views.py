@@ -20,7 +20,7 @@ Images = Float[Tensor, "views 3 height width"]
 
 
 class VirtualViews:
-    """What the CDM needs to denoise views in parts, with renderings that may change.
+    """Hold the conditions and noise of K views, and denoise them in parts.
 
     Args:
         model: frozen.
@@ -40,14 +40,14 @@ class VirtualViews:
         if cameras.shape[1] < 1:
             raise ConfigError("there are no virtual views: set budget.views (or prior.views) to at least 1")
         self.model, self.cameras, self.seed = model, cameras, seed
-        self.encoding = encoding = model.settled(encoding)
+        self.encoding = encoding = model.with_keys_values(encoding)
         self._parts = [slice(i, i + views_at_once) for i in range(0, cameras.shape[1], views_at_once)]
         self._conditions: list[Condition] = []
         for part in self._parts:
             chunk = cameras[:, part]
             with timed("guide"):
                 rendering = model.render(encoding, chunk)
-            self._conditions.append(model.condition(encoding, chunk, rendering.rgb.movedim(-1, 2)))
+            self._conditions.append(model.condition(encoding, chunk, rendering.images))
         self._noise = [generator(encoding.source.device, *seed, view) for view in range(len(self))]
         self.denoiser_calls = 0
         self.field_queries = model.renderer.samples_per_ray * self.first_renderings[:, 0].numel()
@@ -57,11 +57,11 @@ class VirtualViews:
 
     @property
     def first_renderings(self) -> Images:
-        """The single-image NeRF's images of all views, in [0, 1]."""
+        """Images of all views by the single-image NeRF, in [0, 1]."""
         return torch.cat([condition.rendered for condition in self._conditions])
 
-    def reusing(self, deep: DeepReuse | None) -> list[DeepFeatures] | None:
-        """For `denoise` along one reverse process; None where all is computed."""
+    def deep_features(self, deep: DeepReuse | None) -> list[DeepFeatures] | None:
+        """Make room for reused features along one reverse process, for `denoise`; None where all is computed."""
         return None if deep is None or deep.every == 1 else [DeepFeatures(deep) for _ in self._parts]
 
     @timed("denoise")
@@ -73,12 +73,13 @@ class VirtualViews:
         rendered: Images | None = None,
         deep: Sequence[DeepFeatures] | None = None,
     ) -> Images:
-        """x0 of every view, clamped to [-1, 1] as images are.
+        """Return x0 of every view, clamped to [-1, 1].
 
         Args:
+            z: noised images Z_t.
             t: of each view.
-            rendered: what the CDM is conditioned on, in [0, 1]; None: the first renderings.
-            deep: `reusing`, where calls follow each other along one reverse process; None computes all.
+            rendered: renderings that condition the CDM, in [0, 1]; None: the first renderings.
+            deep: `deep_features`, where calls follow each other along one reverse process; None computes all.
         """
         self.denoiser_calls += len(z)
         x0 = []
@@ -90,14 +91,14 @@ class VirtualViews:
         return torch.cat(x0).clamp(-1, 1)
 
     def noise(self) -> Images:
-        """Fresh standard normal images, each from its own view's stream."""
+        """Draw standard normal images, each from its own view's stream."""
         return torch.stack([self.noise_of(view) for view in range(len(self))])
 
     def noise_of(self, view: int) -> Float[Tensor, "3 height width"]:
-        """A fresh standard normal image from one view's stream."""
+        """Draw a standard normal image from one view's stream."""
         source = self._noise[view]
         return torch.randn(self._conditions[0].rendered.shape[1:], generator=source, device=source.device)
 
     def uniform(self) -> Float[Tensor, "views"]:
-        """A fresh number in [0, 1) for every view, from its own stream."""
+        """Draw a number in [0, 1) for every view, from its own stream."""
         return torch.stack([torch.rand((), generator=g, device=g.device) for g in self._noise])

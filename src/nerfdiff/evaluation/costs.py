@@ -1,4 +1,4 @@
-"""What predictions cost: the fields of a row, from what was written down of each scene."""
+"""The costs of predictions: fields of a row, from the records of each scene."""
 
 import logging
 from collections import Counter
@@ -9,7 +9,7 @@ import torch
 
 from nerfdiff.distill.strategy import Strategy
 from nerfdiff.evaluation.predict import costs
-from nerfdiff.evaluation.subject import Subject
+from nerfdiff.evaluation.run import EvaluationRun
 from nerfdiff.field import cpu_field
 from nerfdiff.render import backend
 from nerfdiff.results.row import Timing
@@ -21,12 +21,12 @@ PARTS = ("denoise", "fit", "guide")
 STABILITY = ("nonfinite_grad_steps", "loss_spikes", "grad_norm_p99")
 
 
-def cost_fields(subject: Subject, strategy: Strategy) -> dict[str, Any]:
-    """The cost fields of a row, with what computed: `model_fields`, the backend, K, and how many scenes fell back.
+def cost_fields(run: EvaluationRun, strategy: Strategy) -> dict[str, Any]:
+    """Return the cost fields of a row, with `model_fields`, the backend, K, and how many scenes fell back.
 
-    Only counts for a baseline, of which no model ran.
+    A baseline, which runs no model, has counts alone.
     """
-    scenes = costs(subject, strategy)
+    scenes = costs(run, strategy)
     fields: dict[str, Any] = {
         "denoiser_calls": sum(int(cost["denoiser_calls"]) for cost in scenes),
         "field_queries": sum(int(cost["field_queries"]) for cost in scenes),
@@ -34,13 +34,13 @@ def cost_fields(subject: Subject, strategy: Strategy) -> dict[str, Any]:
     if fields["field_queries"] == 0:
         return fields
     # a run that went on elsewhere, or with other threads, has numbers of all its scenes, and seconds of these
-    alike = [cost for cost in scenes if cost["conditions"] == subject.conditions]
+    alike = [cost for cost in scenes if cost["conditions"] == run.cost_key]
     fields["scene_s"] = _timing(alike, "seconds")
     fields |= {f"{name}_s": _timing(alike, name) for name in ("encode", "render")}
     if fields["denoiser_calls"]:
         fields |= {f"{name}_s": _timing(alike, name) for name in ("distill", *PARTS)}
-    fields["timing_s"] = cost_of_a_piece(subject.device) * fmean(cost["pieces"] for cost in scenes)
-    fields |= model_fields(subject) | {"backend": _backend(subject)}
+    fields["timing_s"] = cost_of_a_piece(run.device) * fmean(cost["pieces"] for cost in scenes)
+    fields |= model_fields(run) | {"backend": _backend(run)}
     fields["peak_mem_bytes"] = max((cost["peak_mem_bytes"] for cost in alike), default=None)
     # of the views that were fitted, not of those asked for; a run may go on from one that did not write them down
     virtual = {cost["virtual_views"] for cost in scenes if cost.get("virtual_views") is not None}
@@ -53,35 +53,35 @@ def cost_fields(subject: Subject, strategy: Strategy) -> dict[str, Any]:
     return fields | {"fallbacks": fallen.total()}
 
 
-def model_fields(subject: Subject) -> dict[str, Any]:
-    """What computes, as far as it is known before anything was computed."""
-    model = subject.model
+def model_fields(run: EvaluationRun) -> dict[str, Any]:
+    """Return the fields that describe the model, known before anything is computed."""
+    model = run.model
     return {
         "model": model.name,
         "field": model.field_name,
         "params": model.parameter_count()["total"],
         "samples_per_ray": model.renderer.samples_per_ray,
-        "compile": subject.cfg.compile != "none",
-        "scenes_at_once": subject.cfg.scenes_at_once,
-    } | {name: subject.stability.get(name) for name in STABILITY}
+        "compile": run.settings.compiled,
+        "scenes_at_once": run.settings.scenes_at_once,
+    } | {name: run.stability.get(name) for name in STABILITY}
 
 
 def _timing(scenes: list[dict[str, Any]], name: str) -> Timing | None:
-    """Of the scenes that came after a process's first, which warm it up; of all where there are no others."""
+    """Summarise a time over the scenes after each process's first, which warms it up; over all if there is no other."""
     measured = [cost for cost in scenes if name in cost]
     warm = [cost[name] for cost in measured if cost.get("warm")]
     return summarise(warm or [cost[name] for cost in measured])
 
 
 @torch.no_grad()
-def _backend(subject: Subject) -> str:
-    """What renders, whatever was asked for: `torch`, `triton`, or `cpu`, PyTorch in the order that suits a CPU."""
-    model = subject.model
+def _backend(run: EvaluationRun) -> str:
+    """Return the backend in use: `torch`, `triton`, or `cpu`, PyTorch in the order that suits a CPU."""
+    model = run.model
     if model.renderer.backend == "torch":
         return "torch"
-    scene = next(iter(subject.load(subject.scene_ids[:1]))).to(subject.device)
-    with subject.autocast():
-        field = model.field(model.encode(scene.source, scene.source_cameras, scene.near, scene.far))
+    scene = next(iter(run.load(run.scene_ids[:1]))).to(run.device)
+    with run.autocast():
+        field = model.field(model.encode(scene))
         rays = scene.target_cameras[:, 0].rays(scene.near, scene.far)
     chosen = backend.chosen(model.renderer, field, rays)
     if chosen == "torch" and model.renderer.backend == "auto" and cpu_field.suits(field, rays):

@@ -1,4 +1,4 @@
-"""What evaluate.py and distill.py leave for TensorBoard: a run for every row."""
+"""TensorBoard for evaluate.py and distill.py: a run for every row of results."""
 
 import csv
 import logging
@@ -41,7 +41,7 @@ PER_SCENE = ("denoiser_calls", "field_queries")
 
 @dataclass(frozen=True)
 class Dashboard:
-    """Writes `tensorboard/` beside the file of results.
+    """Write `tensorboard/` beside the file of results.
 
     A row's run holds its settings, metrics and costs, text and contact sheet. Its curves, over the steps of
     distillation and over the scenes, are a run of `curves/`: all scalars of the first are columns of the HPARAMS tab.
@@ -55,7 +55,7 @@ class Dashboard:
     layout: Layout
 
     def write(self, cfg: DictConfig, row: ResultRow, sheet: Path | None) -> None:
-        """The run of one row, in place of what an earlier one of this name left.
+        """Write the run of one row, in place of an earlier one of this name.
 
         Args:
             cfg: of the command.
@@ -63,10 +63,10 @@ class Dashboard:
         """
         home = Path(cfg.results).parent
         name, hparams = _name(row), _hparams(row, self.ignored)
-        told = {"status": row.status, "error": row.error, **hparams, **_metrics(row)}
+        facts = {"status": row.status, "error": row.error, **hparams, **_metrics(row)}
         settings = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
         texts = {
-            "about": f"{tensorboard.code(row.command or '')}\n\n{tensorboard.table(told)}",
+            "about": f"{tensorboard.code(row.command or '')}\n\n{tensorboard.table(facts)}",
             "config": tensorboard.code(OmegaConf.to_yaml(settings, resolve=HydraConfig.initialized()), "yaml"),
         }
         with _fresh(home / FOLDER / name) as writer:
@@ -102,7 +102,7 @@ def show_in_dashboard(cfg: DictConfig, rows: Sequence[ResultRow], sheet: Path | 
 
 
 def _name(row: ResultRow) -> str:
-    """Of a row's run: where its predictions lie and, as several may lie there, its strategy."""
+    """Name a row's run by the folder of its predictions and, as several strategies may lie there, its strategy."""
     if row.folder is None:
         return f"failed/{row.strategy}-{sha256_values(row.overrides)[:8]}"
     folder = Path(*(part for part in Path(row.folder).parts if part != ".."))
@@ -132,21 +132,21 @@ def _metrics(row: ResultRow) -> dict[str, float]:
 
 
 def _traces(home: Path, row: ResultRow) -> dict[str, list[float | None]]:
-    """What was written down of each step of distillation, where it was: the mean over scenes."""
+    """Read the traces of distillation, where there are any: means over scenes, by step."""
     folder = home / row.folder / "predictions" / row.strategy
     scenes = [_read(folder / scene / TRACE) for scene in read_plan(folder)["scenes"]]
-    steps = list(zip_longest(*filter(None, scenes), fillvalue={}))  # a scene that was lost has fewer
+    steps = list(zip_longest(*filter(None, scenes), fillvalue={}))  # a scene that failed has fewer
     return {f"distill/{field.name}": [_mean(step, field.name) for step in steps] for field in fields(Step) if steps}
 
 
 def _scenes(home: Path, row: ResultRow) -> dict[str, list[float | None]]:
-    """What was measured of each scene, in the order of the scenes."""
+    """Read the metrics of each scene, in the order of the scenes."""
     scenes = _read(home / row.folder / "scores" / row.strategy / "per_scene.csv")
     return {f"scenes/{name}": [_mean([scene], name) for scene in scenes] for name in (*IMAGE_METRICS, *SCENE_METRICS)}
 
 
 def _mean(lines: Sequence[Mapping[str, str]], column: str) -> float | None:
-    """Of the cells that hold finite numbers."""
+    """Return the mean of the cells that hold finite numbers."""
     cells = [float(line[column]) for line in lines if line.get(column)]
     cells = [value for value in cells if math.isfinite(value)]
     return fmean(cells) if cells else None
@@ -161,7 +161,7 @@ def _read(path: Path) -> list[dict[str, str]]:
 
 @contextmanager
 def _fresh(folder: Path) -> Iterator[SummaryWriter]:
-    """A writer into `folder`, of which nothing else is left afterwards."""
+    """Open a writer into `folder`, and remove its earlier event files afterwards."""
     before = list(folder.glob("events.*"))
     with SummaryWriter(str(folder)) as writer:
         yield writer

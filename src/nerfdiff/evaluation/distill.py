@@ -19,7 +19,7 @@ from nerfdiff.evaluation.evaluate import show
 from nerfdiff.evaluation.measure import measure, record_failure
 from nerfdiff.evaluation.pictures import sheet
 from nerfdiff.evaluation.predict import done, predict, require_all
-from nerfdiff.evaluation.subject import Subject, choose_device, dataset_subject, picture_subject
+from nerfdiff.evaluation.run import EvaluationRun, choose_device, dataset_run, picture_run
 from nerfdiff.processes import end_launched, lost_process, watch
 from nerfdiff.results.row import ResultRow
 from nerfdiff.stopping import Stopped
@@ -43,49 +43,51 @@ def distill(cfg: DictConfig) -> ResultRow | None:
         UserError: bad data, picture, config or checkpoint. A run over a dataset is appended as a failed row first;
             within a sweep the row is all, and the other jobs go on.
     """
-    subject, strategy = None, None
+    run, strategy = None, None
     try:
         fabric = _launch(cfg)
-        subject = picture_subject(cfg, fabric.device) if cfg.image else dataset_subject(cfg, fabric.device)
+        run = picture_run(cfg, fabric.device) if cfg.image else dataset_run(cfg, fabric.device)
         strategy, scorer = _strategy(cfg), None if cfg.image else instantiate(cfg.metrics)
-        _predict_together(fabric, subject, strategy)
+        _predict_together(fabric, run, strategy)
         if fabric.global_rank > 0:
             return None
-        require_all(subject, strategy)
-        row = measure(subject, strategy, scorer, subject.data.reader("test")) if subject.data else None
+        require_all(run, strategy)
+        row = measure(run, strategy, scorer, run.data.reader("test")) if run.data else None
     except Stopped as stopped:
         end_launched(stopped.signum)
-        raise Stopped(stopped.signum, done(subject, strategy) if subject and strategy else "") from None
+        raise Stopped(stopped.signum, done(run, strategy) if run and strategy else "") from None
     except Exception as error:
         if cfg.image or _rank() > 0:
             raise
-        row = record_failure(cfg, error, subject, strategy)
+        row = record_failure(cfg, error, run, strategy)
         if _in_a_sweep():
             log.exception("this job of the sweep failed")
             return row
         raise
-    pictures = sheet(subject, [strategy], subject.folder / "sheet.png") if cfg.sheet.scenes > 0 else None
+    pictures = sheet(run, [strategy], run.folder / "sheet.png") if cfg.sheet.scenes > 0 else None
     log.info("contact sheet: %s", pictures or "none")
     if row is not None:
         show_in_dashboard(cfg, [row], pictures)
-        show([row], subject.folder / "table.md")
-    log.info("fields, traces and orbits: %s", subject.predictions / strategy.name)
+        show([row], run.folder / "table.md")
+    log.info("fields, traces and orbits: %s", run.predictions / strategy.name)
     return row
 
 
 def _strategy(cfg: DictConfig) -> Strategy:
-    """`cfg.strategy`; for a picture with the views that it is to be seen from as Π, no dataset's."""
+    """Build `cfg.strategy`; for a picture with `cfg.picture_views` as Π, instead of a dataset's."""
     settings = plain(cfg.strategy)
     if cfg.image and "prior" in settings:
         settings["prior"] = plain(cfg.picture_views)
-        _warn_of_inert(HydraConfig.get().overrides.task if HydraConfig.initialized() else ())
+        _warn_of_unused(HydraConfig.get().overrides.task if HydraConfig.initialized() else ())
     return instantiate(settings)
 
 
-def _warn_of_inert(overrides: Sequence[str]) -> None:
-    aside = [word for word in overrides if re.match(r"[+~]*(prior|data)\b", word)]
-    if aside:
-        log.warning("%s cannot act on a picture: it is seen from picture_views, and needs no dataset", ", ".join(aside))
+def _warn_of_unused(overrides: Sequence[str]) -> None:
+    unused = [word for word in overrides if re.match(r"[+~]*(prior|data)\b", word)]
+    if unused:
+        log.warning(
+            "%s cannot act on a picture: its views are picture_views, and it needs no dataset", ", ".join(unused)
+        )
 
 
 def _rank() -> int:
@@ -97,7 +99,7 @@ def _in_a_sweep() -> bool:
 
 
 def _launch(cfg: DictConfig) -> Fabric:
-    """The processes that share the scenes: one per GPU, or several on the CPU.
+    """Launch the processes that share the scenes: one per GPU, or several on the CPU.
 
     Raises:
         ConfigError: there are not as many devices, or every job of a sweep would launch its own.
@@ -122,11 +124,11 @@ def _launch(cfg: DictConfig) -> Fabric:
     return fabric
 
 
-def _predict_together(fabric: Fabric, subject: Subject, strategy: Strategy) -> None:
-    """Each process its share; where one fails the others still finish theirs, and all then fail with its words."""
+def _predict_together(fabric: Fabric, run: EvaluationRun, strategy: Strategy) -> None:
+    """Predict this process's share. Where one fails the others finish theirs, and all then fail with its message."""
     failure: Exception | None = None
     try:
-        predict(subject, strategy, fabric.global_rank, fabric.world_size)
+        predict(run, strategy, fabric.global_rank, fabric.world_size)
     except Exception as error:
         if fabric.world_size == 1:
             raise
@@ -140,7 +142,7 @@ def _predict_together(fabric: Fabric, subject: Subject, strategy: Strategy) -> N
     except RuntimeError as error:
         if not (sentence := lost_process(error)):
             raise
-        raise ProcessLost(f"{sentence} {done(subject, strategy)} The same command goes on") from (failure or error)
+        raise ProcessLost(f"{sentence} {done(run, strategy)} The same command goes on") from (failure or error)
     if failure is not None:
         raise failure
     for rank, said in enumerate(words):

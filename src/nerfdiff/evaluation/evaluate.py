@@ -17,7 +17,7 @@ from nerfdiff.evaluation.dashboard import show_in_dashboard
 from nerfdiff.evaluation.measure import measure, record_failure
 from nerfdiff.evaluation.pictures import sheet, video
 from nerfdiff.evaluation.predict import done, predict, require_all
-from nerfdiff.evaluation.subject import choose_device, dataset_subject
+from nerfdiff.evaluation.run import choose_device, dataset_run
 from nerfdiff.results.row import ResultRow
 from nerfdiff.results.table import rich_table, write_markdown
 from nerfdiff.stopping import Stopped
@@ -41,33 +41,33 @@ def evaluate(cfg: DictConfig) -> list[ResultRow]:
     """
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
-    subject = dataset_subject(cfg, choose_device(cfg.device))
-    reader = subject.data.reader("test")
-    strategies: list[Strategy] = [instantiate(cfg.strategy), *(_baselines(cfg, subject.data) if cfg.baselines else ())]
+    run = dataset_run(cfg, choose_device(cfg.device))
+    reader = run.data.reader("test")
+    strategies: list[Strategy] = [instantiate(cfg.strategy), *(_baselines(cfg, run.data) if cfg.baselines else ())]
     scorer = instantiate(cfg.metrics)
     rows = []
     for strategy in strategies:
         try:
-            predict(subject, strategy)
-            require_all(subject, strategy)
-            rows.append(measure(subject, strategy, scorer, reader))
+            predict(run, strategy)
+            require_all(run, strategy)
+            rows.append(measure(run, strategy, scorer, reader))
         except Stopped as stopped:
-            raise Stopped(stopped.signum, done(subject, strategy)) from None
+            raise Stopped(stopped.signum, done(run, strategy)) from None
         except Exception as error:
-            record_failure(cfg, error, subject, strategy)
+            record_failure(cfg, error, run, strategy)
             raise
-    pictures = sheet(subject, strategies, subject.folder / "sheet.png") if cfg.sheet.scenes > 0 else None
+    pictures = sheet(run, strategies, run.folder / "sheet.png") if cfg.sheet.scenes > 0 else None
     log.info("contact sheet: %s", pictures or "none")
     show_in_dashboard(cfg, rows, pictures)
     if cfg.orbit.scenes > 0:
-        log.info("video: %s", video(subject, strategies[0], subject.folder / "orbit.mp4"))
-    show(rows, subject.folder / "table.md")
-    log.info("rows: %s   scores per image and scene: %s", cfg.results, subject.folder / "scores")
+        log.info("video: %s", video(run, strategies[0], run.folder / "orbit.mp4"))
+    show(rows, run.folder / "table.md")
+    log.info("rows: %s   scores per image and scene: %s", cfg.results, run.folder / "scores")
     return rows
 
 
 def _baselines(cfg: DictConfig, data: SceneDataModule) -> list[Strategy]:
-    """What knows nothing of 3D; without the mean training image where only the test split was downloaded."""
+    """Build the baselines; without the mean training image where only the test split was downloaded."""
     try:
         reader = data.reader("train")
     except MissingSplit as error:

@@ -6,7 +6,6 @@ import os
 import shlex
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import filelock
@@ -18,45 +17,44 @@ from nerfdiff.data.scene import SceneReader
 from nerfdiff.distill.strategy import Strategy
 from nerfdiff.evaluation.costs import cost_fields, model_fields
 from nerfdiff.evaluation.dashboard import show_in_dashboard
-from nerfdiff.evaluation.subject import Subject, choose_device
+from nerfdiff.evaluation.run import EvaluationRun, RunSettings, choose_device
 from nerfdiff.metrics.predictions import NonFinitePrediction
 from nerfdiff.metrics.score import Scorer, truth_from
 from nerfdiff.results.environment import environment
 from nerfdiff.results.row import ResultRow, append_row
-from nerfdiff.utils.config import plain
 from nerfdiff.utils.errors import ConfigError, TimeUp, is_out_of_memory
 from nerfdiff.utils.hashes import sha256_values
 
 log = logging.getLogger(__name__)
 
 
-def measure(subject: Subject, strategy: Strategy, scorer: Scorer, reader: SceneReader) -> ResultRow:
-    """Score the predictions of one strategy and append its row; one that has no model is timed by nothing.
+def measure(run: EvaluationRun, strategy: Strategy, scorer: Scorer, reader: SceneReader) -> ResultRow:
+    """Score the predictions of one strategy and append its row; a baseline without a model has no times.
 
     Of several processes that made the scenes side by side, the first appends the row.
     """
-    scores = subject.folder / "scores" / strategy.name
-    summary = scorer.score(subject.predictions / strategy.name, truth_from(reader), scores, subject.device)
-    row = replace(_identified(subject, strategy), **summary, **cost_fields(subject, strategy))
+    scores = run.folder / "scores" / strategy.name
+    summary = scorer.score(run.predictions / strategy.name, truth_from(reader), scores, run.device)
+    row = replace(_identified(run, strategy), **summary, **cost_fields(run, strategy))
     if row.fallbacks:
         log.warning("%s %s of %d", strategy.name, row.error, row.n_scenes)
         # where every scene fell back, the numbers are of the fields that distillation began with
         row = replace(row, status="diverged" if row.fallbacks == row.n_scenes else "ok")
-    with filelock.FileLock(subject.folder / ".row.lock"):
-        if _is_appended(subject, row):
+    with filelock.FileLock(run.folder / ".row.lock"):
+        if _is_appended(run, row):
             log.info("another process, which made these scenes too, has appended the row of %s", row.run_id)
         else:
-            append_row(subject.cfg.results, row)
+            append_row(run.settings.results, row)
     return row
 
 
-def _is_appended(subject: Subject, row: ResultRow) -> bool:
-    """Whether a row like this one was appended since this run began."""
-    results = Path(subject.cfg.results)
+def _is_appended(run: EvaluationRun, row: ResultRow) -> bool:
+    """Return true if a row like this one was appended since this run began."""
+    results = run.settings.results
     if not results.is_file():
         return False
     with open(results, "rb") as file:
-        file.seek(subject.rows_before)
+        file.seek(run.rows_before)
         for line in file:
             with suppress(ValueError):
                 other = json.loads(line)
@@ -65,13 +63,16 @@ def _is_appended(subject: Subject, row: ResultRow) -> bool:
     return False
 
 
-def record_failure(cfg: DictConfig, error: Exception, subject: Subject | None, strategy: Strategy | None) -> ResultRow:
-    """A run that failed is a row too, with its status; where it failed early, little else is known of it."""
-    if subject is not None and strategy is not None:
-        row = replace(_identified(subject, strategy), **model_fields(subject))
+def record_failure(
+    cfg: DictConfig, error: Exception, run: EvaluationRun | None, strategy: Strategy | None
+) -> ResultRow:
+    """Append the row of a run that failed, with its status; after an early failure it has few other fields."""
+    if run is not None and strategy is not None:
+        row = replace(_identified(run, strategy), **model_fields(run))
     else:
         name = strategy.name if strategy is not None else cfg.strategy.name
-        row = ResultRow(run_id=f"{cfg.run_name}/{name}", strategy=name, **_asked_for(cfg), **_environment(cfg))
+        asked = _asked_for(RunSettings.of(cfg))
+        row = ResultRow(run_id=f"{cfg.run_name}/{name}", strategy=name, **asked, **_environment(cfg))
     status = "error"
     if isinstance(error, NonFinitePrediction):
         status = "nan"
@@ -85,34 +86,34 @@ def record_failure(cfg: DictConfig, error: Exception, subject: Subject | None, s
     return row
 
 
-def _identified(subject: Subject, strategy: Strategy) -> ResultRow:
-    """A row that says what was run, and of which nothing is measured yet."""
-    cfg = subject.cfg
+def _identified(run: EvaluationRun, strategy: Strategy) -> ResultRow:
+    """Make the row of a run, before anything is measured."""
+    settings = run.settings
     # What the numbers depend on: the identity of the predictions and what they cost, the strategy, how it is scored.
-    config_hash = sha256_values([subject.identity, subject.conditions, strategy.name, plain(cfg.metrics)])
+    config_hash = sha256_values([run.identity, run.cost_key, strategy.name, settings.scoring])
     prior = getattr(strategy, "prior", None)
     return ResultRow(
-        run_id=f"{cfg.run_name}/{strategy.name}-{config_hash[:8]}",
+        run_id=f"{settings.run_name}/{strategy.name}-{config_hash[:8]}",
         config_sha256=config_hash,
-        folder=os.path.relpath(subject.folder, Path(cfg.results).parent),
+        folder=os.path.relpath(run.folder, settings.results.parent),
         strategy=strategy.name,
         prior=prior and type(prior).__name__,
-        **_asked_for(cfg),
-        **environment(subject.device, subject.precision),
-        **{key: subject.identity[key] for key in ("ckpt_sha256", "weights", "split_sha256", "image_size")},
+        **_asked_for(settings),
+        **environment(run.device, run.precision),
+        **{key: run.identity[key] for key in ("ckpt_sha256", "weights", "split_sha256", "image_size")},
     )
 
 
-def _asked_for(cfg: DictConfig) -> dict[str, Any]:
-    """What the config and the command say of a run."""
-    known = {"seed": cfg.seed, "dataset": f"{cfg.data.name}/{cfg.data.test_split}"}
+def _asked_for(settings: RunSettings) -> dict[str, Any]:
+    """Return the fields that the settings and the command tell."""
+    known = {"seed": settings.seed, "dataset": settings.dataset}
     if not HydraConfig.initialized():
         return known
     return known | {"overrides": list(HydraConfig.get().overrides.task), "command": _command(HydraConfig.get())}
 
 
 def _command(hydra: DictConfig) -> str:
-    """The shell command that does what this job does, from the project's folder or as installed."""
+    """Return the shell command that repeats this job, from the project's folder or as installed."""
     words = command_words(hydra.job.config_name)
     if any(word.startswith("sweep=") for word in hydra.overrides.task):
         words.append("hydra.mode=RUN")  # the settings of a sweep's jobs, and not the sweep again
@@ -120,7 +121,7 @@ def _command(hydra: DictConfig) -> str:
 
 
 def _environment(cfg: DictConfig) -> dict[str, Any]:
-    """Of a run that failed before it had a device, as far as that can be told."""
+    """Return the environment of a run that failed before it had a device, as far as it is known."""
     try:
         return environment(choose_device(cfg.device), None if cfg.precision == "auto" else cfg.precision)
     except ConfigError:

@@ -1,4 +1,4 @@
-"""Scene after scene: predictions, and what is left beside them."""
+"""Predict scene after scene, and save predictions, fields and traces."""
 
 import json
 import logging
@@ -14,10 +14,10 @@ from typing import Any
 import torch
 
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.distill.strategy import Strategy, Views
+from nerfdiff.distill.strategy import PredictedViews, Strategy
 from nerfdiff.distill.trace import PLOT, TRACE, plot_trace, write_trace
 from nerfdiff.evaluation.progress import SceneProgress
-from nerfdiff.evaluation.subject import Subject
+from nerfdiff.evaluation.run import EvaluationRun
 from nerfdiff.fit.saved_field import FIELD, SavedField, load_field, save_field
 from nerfdiff.metrics.image import psnr
 from nerfdiff.metrics.predictions import SCENE, PredictionWriter
@@ -32,75 +32,79 @@ ORBIT = "orbit.mp4"
 log = logging.getLogger(__name__)
 
 
-def predict(subject: Subject, strategy: Strategy, rank: int = 0, processes: int = 1) -> None:
+def predict(run: EvaluationRun, strategy: Strategy, rank: int = 0, processes: int = 1) -> None:
     """Predict what is still to do of one process's share; a killed run loses at most the scenes in hand.
 
-    After `cfg.minutes` no scene begins but the first: `require_all` says so to whoever needs them all.
+    After `minutes` no scene begins but the first; `require_all` raises where any is missing.
 
     Raises:
         ConfigError: numbers that cannot be.
     """
-    if subject.cfg.scenes_at_once < 1:
-        raise ConfigError(f"scenes_at_once={subject.cfg.scenes_at_once} must be at least 1")
-    minutes = subject.cfg.minutes
+    if run.settings.scenes_at_once < 1:
+        raise ConfigError(f"scenes_at_once={run.settings.scenes_at_once} must be at least 1")
+    minutes = run.settings.minutes
     if minutes is not None and minutes <= 0:
         raise ConfigError(f"minutes={minutes} must be more than 0, or null")
     until = math.inf if minutes is None else time.monotonic() + 60 * minutes
-    writer = _writer(subject, strategy)
+    writer = _writer(run, strategy)
     share = writer.scenes[rank::processes]
-    if subject.device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(subject.device)
+    if run.device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(run.device)
     to_do = set(writer.pending()).intersection(share)
     warm = False
-    with SceneProgress(strategy.name, len(to_do), subject.cfg.progress_every if rank == 0 else None) as progress:
+    with SceneProgress(strategy.name, len(to_do), run.settings.progress_every if rank == 0 else None) as progress:
         # what another process is making comes last: by then it is done, or to be waited for
         for wait in (False, True):
-            for group in _claimed(subject, writer, share, wait):
-                scenes = [scene.to(subject.device) for scene in group]
+            for group in _claimed(run, writer, share, wait):
+                scenes = [scene.to(run.device) for scene in group]
                 callbacks = progress.callbacks(len(scenes))
-                watch, clock = Stopwatch(subject.device), PartClock(subject.device)
-                with watch.measure(), clock.running(), subject.autocast():
-                    predicted = strategy.predict(subject.model, scenes, subject.cfg.seed, callbacks)
+                watch, clock = Stopwatch(run.device), PartClock(run.device)
+                with watch.measure(), clock.running(), run.autocast():
+                    predicted = strategy.predict(run.model, scenes, run.settings.seed, callbacks)
                 spent = _shares(watch.seconds[0], clock.seconds(), predicted) | {"warm": warm}
                 warm = True
                 for scene, views in zip(scenes, predicted, strict=True):
-                    score = _write(subject, strategy, writer, scene, views, spent)
+                    score = _write(run, strategy, writer, scene, views, spent)
                     writer.release(scene.scene_ids[0])
                     progress.advance("" if score is None else f"PSNR {score:.2f}")
                 if time.monotonic() > until:
                     return
 
 
-def _claimed(subject: Subject, writer: PredictionWriter, share: Sequence[str], wait: bool) -> Iterator[list[ViewBatch]]:
-    """Groups of scenes that are fitted together, of those still to do that no other process makes."""
+def _claimed(
+    run: EvaluationRun, writer: PredictionWriter, share: Sequence[str], wait: bool
+) -> Iterator[list[ViewBatch]]:
+    """Yield groups of scenes to be fitted together, of those still to do that no other process makes."""
     to_do = set(writer.pending())
     pending = [scene for scene in share if scene in to_do]
     if wait and pending:
         log.info("another process is making %s: waiting for it", some(pending))
-    loaded = (scene for scene in (subject.load(pending) if pending else ()) if writer.claim(scene.scene_ids[0], wait))
-    while group := list(islice(loaded, 1 if wait else subject.cfg.scenes_at_once)):
+    loaded = (scene for scene in (run.load(pending) if pending else ()) if writer.claim(scene.scene_ids[0], wait))
+    while group := list(islice(loaded, 1 if wait else run.settings.scenes_at_once)):
         yield group
 
 
-def done(subject: Subject, strategy: Strategy) -> str:
-    """A sentence on how many scenes are complete."""
-    writer = _writer(subject, strategy)
+def done(run: EvaluationRun, strategy: Strategy) -> str:
+    """Return a sentence on how many scenes are complete."""
+    writer = _writer(run, strategy)
     total = len(writer.scenes)
     return f"{total - len(writer.pending())} of {total} scenes of {strategy.name} are saved in {writer.folder}."
 
 
-def require_all(subject: Subject, strategy: Strategy) -> None:
-    """Raises TimeUp where the minutes were spent before the last scene."""
-    writer = _writer(subject, strategy)
+def require_all(run: EvaluationRun, strategy: Strategy) -> None:
+    """Raise TimeUp where the minutes were spent before the last scene."""
+    writer = _writer(run, strategy)
     if missing := len(writer.pending()):
         raise TimeUp(
-            f"minutes={subject.cfg.minutes} were spent after {len(writer.scenes) - missing} of {len(writer.scenes)} "
+            f"minutes={run.settings.minutes} were spent after {len(writer.scenes) - missing} of {len(writer.scenes)} "
             f"scenes of {strategy.name}; the same command goes on"
         )
 
 
-def _shares(seconds: float, parts: Mapping[str, Sequence[float]], predicted: Sequence[Views]) -> dict[str, float]:
-    """Seconds of scenes made together: of an encoding, of rendering a view, and else for each scene as if alone."""
+def _shares(
+    seconds: float, parts: Mapping[str, Sequence[float]], predicted: Sequence[PredictedViews]
+) -> dict[str, float]:
+    """Return seconds per encoding, per rendered view, and per scene of those made together."""
     spent = {"seconds": seconds, "pieces": sum(map(len, parts.values()))}
     spent |= {name: sum(pieces) for name, pieces in parts.items()}
     of = {"encode": len(parts.get("encode", ())), "render": sum(len(views.images) for views in predicted)}
@@ -111,11 +115,11 @@ def _shares(seconds: float, parts: Mapping[str, Sequence[float]], predicted: Seq
 
 
 def _write(
-    subject: Subject,
+    run: EvaluationRun,
     strategy: Strategy,
     writer: PredictionWriter,
     scene: ViewBatch,
-    views: Views,
+    views: PredictedViews,
     spent: Mapping[str, float],
 ) -> float | None:
     """Save one scene's views, and what was `spent` on it, see `_shares`; their PSNR, if there is a truth."""
@@ -128,64 +132,64 @@ def _write(
         opacity=views.opacity,
         cost={
             **spent,
-            "conditions": subject.conditions,
-            "peak_mem_bytes": _peak_memory(subject.device),
+            "conditions": run.cost_key,
+            "peak_mem_bytes": _peak_memory(run.device),
             "denoiser_calls": views.denoiser_calls,
             "field_queries": views.field_queries,
             "virtual_views": views.virtual_views,
         },
         status=views.status,
-        beside=partial(_leave, subject, strategy, scene, views),
+        beside=partial(_leave, run, strategy, scene, views),
     )
-    return psnr(views.images.clamp(0, 1), scene.targets[0]).mean().item() if subject.data else None
+    return psnr(views.images.clamp(0, 1), scene.targets[0]).mean().item() if run.data else None
 
 
-def _leave(subject: Subject, strategy: Strategy, scene: ViewBatch, views: Views, folder: Path) -> None:
-    """The field, its trace and an orbit in the scene's folder; a field that was fitted in any case."""
-    if views.field is not None and (views.trace or subject.cfg.per_scene):
+def _leave(run: EvaluationRun, strategy: Strategy, scene: ViewBatch, views: PredictedViews, folder: Path) -> None:
+    """Write the field, its trace and an orbit into the scene's folder; a field that was fitted in any case."""
+    if views.field is not None and (views.trace or run.settings.per_scene):
         save_field(folder / FIELD, views.field)
-    if not subject.cfg.per_scene:
+    if not run.settings.per_scene:
         return
     if views.trace:
         write_trace(folder / TRACE, views.trace)
         plot_trace(folder / PLOT, views.trace)
-    if subject.cfg.orbit.frames > 0:
-        orbit_video(folder / ORBIT, orbit_frames(subject, strategy, scene, views.field), subject.cfg.orbit.fps)
+    if run.settings.orbit.frames > 0:
+        orbit_video(folder / ORBIT, orbit_frames(run, strategy, scene, views.field), run.settings.orbit.fps)
 
 
 @torch.no_grad()
-def orbit_frames(subject: Subject, strategy: Strategy, scene: ViewBatch, saved: SavedField | None) -> torch.Tensor:
-    """A circle around the object [frames, 3, height, width]: of the field, or predicted where there is none."""
-    cameras = orbit(scene.source_cameras, scene.target_cameras[0], subject.cfg.orbit.frames)[None]
+def orbit_frames(run: EvaluationRun, strategy: Strategy, scene: ViewBatch, saved: SavedField | None) -> torch.Tensor:
+    """Render a circle around the object [frames, 3, height, width], or predict it where there is no field."""
+    cameras = orbit(scene.source_cameras, scene.target_cameras[0], run.settings.orbit.frames)[None]
     if saved is not None:
-        field = saved.field.to(subject.device)
-        return field.render(saved.renderer, cameras).rgb[0].movedim(-1, 1).cpu()
+        field = saved.field.to(run.device)
+        return field.render(saved.renderer, cameras).images[0].cpu()
     frames = scene.source_pixels[:, None].expand(-1, cameras.shape[1], -1, -1, -1)
     view = replace(scene, target_cameras=cameras, target_pixels=frames, target_depth=None, target_mask=None)
-    with subject.autocast():
-        (views,) = strategy.predict(subject.model, [view], subject.cfg.seed)
+    with run.autocast():
+        (views,) = strategy.predict(run.model, [view], run.settings.seed)
     return views.images.cpu()
 
 
-def saved_field(subject: Subject, strategy: Strategy, scene_id: str) -> SavedField | None:
-    """The field that `predict` left, if the strategy has one and it was kept."""
-    path = subject.predictions / strategy.name / scene_id / FIELD
+def saved_field(run: EvaluationRun, strategy: Strategy, scene_id: str) -> SavedField | None:
+    """Load the field that `predict` saved, if the strategy has one and it was kept."""
+    path = run.predictions / strategy.name / scene_id / FIELD
     return load_field(path) if path.is_file() else None
 
 
-def costs(subject: Subject, strategy: Strategy) -> list[dict[str, Any]]:
-    """What each scene cost to predict, and its status."""
-    folder = _writer(subject, strategy).folder
-    facts = [json.loads((folder / scene / SCENE).read_text()) for scene in subject.scene_ids]
+def costs(run: EvaluationRun, strategy: Strategy) -> list[dict[str, Any]]:
+    """Return each scene's costs and status."""
+    folder = _writer(run, strategy).folder
+    facts = [json.loads((folder / scene / SCENE).read_text()) for scene in run.scene_ids]
     return [fact["cost"] | {"status": fact["status"]} for fact in facts]
 
 
 def _peak_memory(device: torch.device) -> int:
-    """Bytes so far: allocated on a GPU; on a CPU the process's resident set, everything it imports included."""
+    """Return peak bytes so far: allocated on a GPU; on a CPU the process's resident set, imports included."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     return peak_memory()
 
 
-def _writer(subject: Subject, strategy: Strategy) -> PredictionWriter:
-    return PredictionWriter(subject.predictions, strategy.name, subject.scene_ids, subject.identity)
+def _writer(run: EvaluationRun, strategy: Strategy) -> PredictionWriter:
+    return PredictionWriter(run.predictions, strategy.name, run.scene_ids, run.identity)

@@ -1,4 +1,4 @@
-"""How far scenes are: a bar on a terminal, elsewhere a line now and then."""
+"""Progress over scenes: a bar on a terminal, elsewhere a line now and then."""
 
 import logging
 import sys
@@ -49,22 +49,22 @@ class SceneProgress(AbstractContextManager):
         self._bar.stop()
 
     def callbacks(self, scenes: int) -> Sequence[Callback]:
-        """Of the Trainer that fits so many scenes together: none where nobody looks, as they wait for the device."""
+        """Return callbacks for a Trainer that fits so many scenes; none without output, as they wait for the device."""
         if self._every is None and self._bar.disable:
             return ()
 
-        def tell(share: float, words: str) -> None:
+        def report(share: float, words: str) -> None:
             self._within = share * scenes
-            self._tell(words)
+            self._update(words)
 
-        return [DistillationBar(tell, self._every or 0.5)]
+        return [DistillationBar(report, self._every or 0.5)]
 
     def advance(self, words: str) -> None:
-        """One more scene is done."""
+        """Count one more scene as done."""
         self._done, self._within = self._done + 1, 0.0
-        self._tell(words)
+        self._update(words)
 
-    def _tell(self, words: str) -> None:
+    def _update(self, words: str) -> None:
         done, now = self._done + self._within, time.monotonic()
         left = ""
         if 0 < done < self.total:

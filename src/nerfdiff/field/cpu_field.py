@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nerfdiff.cameras import Rays
-from nerfdiff.field.field import FieldFn, TriplaneField
+from nerfdiff.field.field import Field, TriplaneField
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.utils.precision import full_precision
 
@@ -53,8 +53,8 @@ class Interpolate(torch.autograd.Function):
         return total, None, None, None
 
 
-def suits(field: FieldFn, rays: Rays) -> bool:
-    """Whether `scene_by_scene` can stand for this field along these rays.
+def suits(field: Field, rays: Rays) -> bool:
+    """Return true if `scene_by_scene` can stand for this field along these rays.
 
     It can on a CPU, in fp32 (float64 is for references), where gradients go to planes and decoder alone.
     """
@@ -70,7 +70,7 @@ def suits(field: FieldFn, rays: Rays) -> bool:
 
 
 def scene_by_scene(field: TriplaneField) -> list["CpuField"]:
-    """One field for each scene of a batch: the texels of one scene stay in a core's cache, those of all do not."""
+    """Return one field for each scene of a batch: the texels of one scene fit a core's cache."""
     triplane, hidden, output = field.triplane, field.decoder.hidden, field.decoder.output
     with full_precision(triplane.planes.device):
         texels = triplane.planes.permute(0, 1, 3, 4, 2).flatten(1, 3)
@@ -104,7 +104,10 @@ class CpuField:
     weight: Float[Tensor, "4 hidden"]
     bias: Float[Tensor, "4"]
 
-    def __call__(self, points: Float[Tensor, "1 n 3"]) -> tuple[Float[Tensor, "1 n 3"], Float[Tensor, "1 n"]]:
+    def __call__(
+        self, points: Float[Tensor, "1 n 3"], directions: Float[Tensor, "1 n 3"] | None = None
+    ) -> tuple[Float[Tensor, "1 n 3"], Float[Tensor, "1 n"]]:
+        """See `Field`; the colour is the same from all directions."""
         with full_precision(points.device):
             coordinates, valid = self.field.triplane.frustum_coordinates(points)
             hidden = F.silu(Interpolate.apply(self.table, *self._cells(coordinates[0])))
@@ -115,7 +118,7 @@ class CpuField:
     def _cells(
         self, coordinates: Float[Tensor, "n 3"]
     ) -> tuple[Int32[Tensor, "n 3"], Float[Tensor, "n 3 4"], Int32[Tensor, "4"]]:
-        """In each plane: the row of a cell's first corner and the weights of all four; and where those rows are."""
+        """Return, per plane, the row of a cell's first corner and the weights of all four; and the rows' offsets."""
         height, width = self.field.triplane.planes.shape[-2:]
         x, y, z = coordinates.unbind(-1)
         column, row = _between(x, width), _between(y, height)
@@ -132,7 +135,7 @@ class CpuField:
 
 
 class _Between(NamedTuple):
-    """Between which texels: the first, and the shares of it and of the next."""
+    """The first of two texels, and the shares of it and of the next."""
 
     first: Int32[Tensor, "n"]
     left: Float[Tensor, "n"]
@@ -140,7 +143,7 @@ class _Between(NamedTuple):
 
 
 def _between(coordinate: Float[Tensor, "n"], texels: int) -> _Between:
-    """Where along an axis of that many texels, whose outer edges are -1 and 1; the border texels continue."""
+    """Place a coordinate between texels of an axis whose outer edges are -1 and 1; the border texels continue."""
     position = (0.5 * texels * (coordinate + 1) - 0.5).clamp(0, texels - 1)
     first = position.int().clamp(0, max(0, texels - 2))
     past = position - first

@@ -31,7 +31,7 @@ class Decoder(nn.Module):
 
     @property
     def settings(self) -> dict[str, int | float]:
-        """The arguments that make another one of this shape."""
+        """Arguments that make another decoder of this shape."""
         return {
             "channels": self.hidden.in_features,
             "hidden": self.hidden.out_features,
@@ -40,11 +40,11 @@ class Decoder(nn.Module):
         }
 
     def for_scenes(self, scenes: int) -> "Decoder":
-        """A copy to fit: for several scenes, one whose parameters are each scene's own, along a leading axis."""
+        """Return a copy to fit; for several scenes with parameters of each along a leading axis."""
         return self._changed(lambda value: value.expand(scenes, *value.shape) if scenes > 1 else value)
 
     def of_scene(self, scene: int) -> "Decoder":
-        """A copy with one scene's parameters, of a decoder made `for_scenes`."""
+        """Return a copy with one scene's parameters, of a decoder made `for_scenes`."""
         return self._changed(lambda value: value[scene] if self.hidden.weight.ndim == 3 else value)
 
     def _changed(self, function: Callable[[Tensor], Tensor]) -> "Decoder":
@@ -57,18 +57,18 @@ class Decoder(nn.Module):
     def forward(
         self, features: Float[Tensor, "*points channels"]
     ) -> tuple[Float[Tensor, "*points 3"], Float[Tensor, "*points"]]:
-        """Colour in [0, 1], and density per unit of the frustum's depth, both fp32."""
+        """Return colour in [0, 1], and density per unit of the frustum's depth, both fp32."""
         return self.activated(_linear(self.output, F.silu(_linear(self.hidden, features))))
 
     def activated(self, out: Float[Tensor, "*points 4"]) -> tuple[Float[Tensor, "*points 3"], Float[Tensor, "*points"]]:
-        """Colour and density from the output layer's numbers."""
+        """Return colour and density from the output layer's numbers."""
         return activated(out, self.density_shift, self.density_scale)
 
 
 def activated(
     out: Float[Tensor, "*points 4"], density_shift: float, density_scale: float
 ) -> tuple[Float[Tensor, "*points 3"], Float[Tensor, "*points"]]:
-    """Colour and density, both fp32, from the four numbers that a network ends in."""
+    """Return colour in [0, 1] and density, both fp32, from a network's four outputs."""
     out = at_least_single(out)
     # Softplus: exp overflows in half precision, and a ReLU dies on white backgrounds.
     density = density_scale * F.softplus(out[..., 3] + density_shift)
@@ -76,7 +76,7 @@ def activated(
 
 
 def _linear(layer: nn.Linear, x: Float[Tensor, "*points channels"]) -> Float[Tensor, "*points out"]:
-    """A layer, or one for each scene of a batch [scenes, n, channels]."""
+    """Apply a layer, or one for each scene of a batch [scenes, n, channels]."""
     if layer.weight.ndim == 2:
         return layer(x)
     return torch.baddbmm(layer.bias[:, None], x, layer.weight.mT)

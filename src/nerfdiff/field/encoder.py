@@ -1,4 +1,4 @@
-"""The image encoder e_ψ: one image to what a field is made of, and features for the CDM to attend to."""
+"""The image encoder e_ψ: from one image to a field's features, and features for the CDM to attend to."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,16 +13,17 @@ from nerfdiff.field.resnet import ResNetPyramid
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.field.vision_features import VisionFeatures
 from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.images import to_signed
 
 
 @dataclass(frozen=True)
 class Encoding:
-    """What is known of a scene after one look: computed once per input image, whatever follows.
+    """Features of a scene, computed once per input image.
 
     Args:
         source: the input images in [0, 1].
         features: W = e_ψ(I^s).
-        context: what the CDM attends to: the encoder's features after each attention block, or `NerfDiff.settled`.
+        context: attended to by the CDM: the encoder's features after each attention block, or their keys and values.
     """
 
     source: Float[Tensor, "batch 3 height width"]
@@ -31,7 +32,7 @@ class Encoding:
 
     @property
     def triplane(self) -> Triplane:
-        """W of a field that can be fitted.
+        """The triplane W, the features of a field that can be fitted.
 
         Raises:
             ConfigError: W is no triplane.
@@ -60,7 +61,7 @@ class Encoder(nn.Module):
         far: Float[Tensor, "batch"],
     ) -> Encoding:
         """Encode input images in [0, 1] seen by `cameras` [batch]."""
-        out, features = self.unet(2 * source - 1)
+        out, features = self.unet(to_signed(source))
         planes = out.float().unflatten(1, (3, self.channels))
         return Encoding(source, Triplane(planes, cameras, near, far), features)
 
@@ -70,7 +71,7 @@ class PixelEncoder(nn.Module):
 
     Args:
         backbone: from images to feature maps.
-        with_image: whether points find the colour of their pixel beside its features, as VisionNeRF's do.
+        with_image: give points the colour of their pixel beside its features, as VisionNeRF does.
     """
 
     def __init__(self, backbone: ResNetPyramid | VisionFeatures, with_image: bool):
@@ -87,6 +88,6 @@ class PixelEncoder(nn.Module):
         far: Float[Tensor, "batch"],
     ) -> Encoding:
         """Encode input images in [0, 1] seen by `cameras` [batch]."""
-        image = 2 * source - 1
+        image = to_signed(source)
         maps = (self.backbone(image).float(), *([image] if self.with_image else []))
         return Encoding(source, PixelFeatures(maps, cameras, near, far), [])

@@ -1,7 +1,7 @@
-"""A radiance field: what the renderer calls at points."""
+"""Radiance fields: colour and density of points."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F
@@ -13,9 +13,20 @@ from nerfdiff.field.pixel_features import PixelFeatures
 from nerfdiff.field.residual_mlp import ResidualMLP
 from nerfdiff.field.triplane import Triplane
 
-# points [batch, n, 3] -> (colour [batch, n, 3] in [0, 1], density [batch, n] per scene unit)
-FieldFn = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""A `PixelField` stands for one too; the renderer gives it directions beside the points."""
+
+@runtime_checkable
+class Field(Protocol):
+    """A radiance field, as the renderer asks for it."""
+
+    def __call__(
+        self, points: Float[Tensor, "batch n 3"], directions: Float[Tensor, "batch n 3"]
+    ) -> tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n"]]:
+        """Return colours in [0, 1] and densities per scene unit.
+
+        Args:
+            points: in the input camera's space, in scene units.
+            directions: unit direction of each point's ray, in the same space; a field may ignore them.
+        """
 
 
 @dataclass(frozen=True)
@@ -26,8 +37,9 @@ class TriplaneField:
     decoder: Decoder
 
     def __call__(
-        self, points: Float[Tensor, "batch n 3"]
+        self, points: Float[Tensor, "batch n 3"], directions: Float[Tensor, "batch n 3"] | None = None
     ) -> tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n"]]:
+        """See `Field`; the colour is the same from all directions."""
         features, valid = self.triplane.sample(points)
         rgb, density = self.decoder(features)
         return rgb, self.per_scene_unit(density, valid)
@@ -35,18 +47,18 @@ class TriplaneField:
     def per_scene_unit(
         self, density: Float[Tensor, "batch n"], valid: Bool[Tensor, "batch n"]
     ) -> Float[Tensor, "batch n"]:
-        """The decoder's density, which is per unit of the frustum's depth; 0 where the features are not valid."""
+        """Convert the decoder's density per unit of the frustum's depth; 0 where the features are not valid."""
         return _per_scene_unit(density, valid, self.triplane)
 
 
 @dataclass(frozen=True)
 class PixelField:
-    """f_θ(x, d, W(P(x))) of a pixel-aligned NeRF, whose colour and density also depend on where one looks from.
+    """f_θ(x, d, W(P(x))) of a pixel-aligned NeRF, whose colour and density also depend on the viewing direction.
 
     Args:
-        features: W, or what the MLP's layers that take W alone have made of it.
+        features: W, or the outputs of the MLP's layers that take W alone.
         decoder: f_θ.
-        weights: of these layers, for each of the maps on which they are still to work; None where they have.
+        weights: of these layers, for each map that they are still to be applied to; None where they have been.
     """
 
     features: PixelFeatures
@@ -55,10 +67,10 @@ class PixelField:
 
     @staticmethod
     def of(features: PixelFeatures, decoder: ResidualMLP) -> "PixelField":
-        """A field that renders fast.
+        """Make a field that renders fast.
 
-        Interpolation is linear, as those layers are: they may as well come first. They do where that leaves no more
-        channels to gather at a point than there were; then they work on pixels, not on points.
+        Interpolation is linear, as those layers are, so they may come first. They do where that leaves no more channels
+        to gather at a point; then they are applied to pixels, not to points.
         """
         weight, _ = decoder.injection()
         maps, weights = [], []
@@ -71,13 +83,13 @@ class PixelField:
     def __call__(
         self, points: Float[Tensor, "batch n 3"], directions: Float[Tensor, "batch n 3"]
     ) -> tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n"]]:
-        """As a `FieldFn`, given the unit direction of each point's ray in the input camera's space too."""
+        """See `Field`."""
         sampled, valid = self.features.sample(points)
         _, injected = self.decoder.injection()
         parts = sampled.split([one.shape[1] for one in self.features.maps], -1)
         for part, weight in zip(parts, self.weights, strict=True):
             injected = injected + (part if weight is None else F.linear(part, weight))
-        rgb, density = self.decoder.given(self.features.centred(points), directions, injected)
+        rgb, density = self.decoder.from_injected(self.features.centred(points), directions, injected)
         return rgb, _per_scene_unit(density, valid, self.features)
 
 

@@ -1,4 +1,4 @@
-"""The input camera's frustum, in whose coordinates every field of this project looks things up."""
+"""Coordinates of the input camera's frustum, in which every field is defined."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,7 +13,7 @@ def frustum_coordinates(
     near: Float[Tensor, "batch"],
     far: Float[Tensor, "batch"],
 ) -> tuple[Float[Tensor, "batch n 3"], Bool[Tensor, "batch n"]]:
-    """x̃ = [P(x), 2 (x_z − t_n) / (t_f − t_n) − 1], and whether the point lies beyond the near plane.
+    """Return x̃ = [P(x), 2 (x_z − t_n) / (t_f − t_n) − 1], and true where the point is beyond the near plane.
 
     x̃ is in [-1, 1]³ inside the frustum; -1 and 1 are the outer edges of the border pixels. Points before
     t_n are masked before the division: behind the camera they would project to mirrored features.

@@ -15,7 +15,7 @@ TRIPLANE, PIXELNERF, VISIONNERF = FIELDS = ("triplane", "pixelnerf", "visionnerf
 def encoder_and_decoder(
     name: str, settings: Mapping, unet: Mapping
 ) -> tuple[Encoder | PixelEncoder, Decoder | ResidualMLP]:
-    """e_ψ and f_θ.
+    """Build the encoder e_ψ and the decoder f_θ.
 
     Args:
         name: `triplane`: a U-Net's planes and a shallow decoder; `pixelnerf`: a ResNet's features and a deep MLP;

@@ -1,6 +1,6 @@
-"""Features of the input image that a point finds where it projects to: W of pixel-aligned NeRFs.
+"""Features of the input image at a point's projection: W of pixel-aligned NeRFs.
 
-eq. "pixelnerf" of the paper, after Yu et al. 2021 ("pixelNeRF") and Lin et al. 2023 ("VisionNeRF").
+eq. "pixelnerf" of the paper, after pixelNeRF (arXiv 2012.02190) and VisionNeRF (arXiv 2207.05736).
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from nerfdiff.utils.precision import at_least_single, full_precision
 
 @dataclass(frozen=True)
 class PixelFeatures:
-    """Feature maps aligned with the input images: all points of one of the camera's rays find the same features.
+    """Feature maps aligned with the input images: all points of a ray of the input camera have the same features.
 
     Args:
         maps: each of its own channels and resolution; their outer edges are the image's.
@@ -34,7 +34,7 @@ class PixelFeatures:
     def sample(
         self, points: Float[Tensor, "batch n 3"]
     ) -> tuple[Float[Tensor, "batch n channels"], Bool[Tensor, "batch n"]]:
-        """W(P(x)) of all maps, bilinear, at points of the input camera's space, and where it is defined.
+        """Return W(P(x)) of all maps, bilinear, at points of the input camera's space, and where it is defined.
 
         That is beyond the near plane; outside the image the border features continue. Coordinates and interpolation
         weights stay fp32.
@@ -49,7 +49,7 @@ class PixelFeatures:
         return torch.cat(sampled, 1).mT, valid
 
     def centred(self, points: Float[Tensor, "batch n 3"]) -> Float[Tensor, "batch n 3"]:
-        """Points along the input camera's axes, from the middle of its frustum, in units of t_f − t_n.
+        """Return points along the input camera's axes, from the middle of its frustum, in units of t_f − t_n.
 
         So they are free of the scene's units and of the camera's distance (pixelNeRF's `normalize_z` does the same by
         taking points from the world's origin, where its objects stand). For SRN's cars t_f − t_n is 1.

@@ -24,7 +24,7 @@ class ResidualBlock(nn.Module):
 
 
 class ResidualMLP(nn.Module):
-    """A point's position and viewing direction to colour and density, given the features of its pixel.
+    """Map a point's position and viewing direction to colour and density, given the features of its pixel.
 
     The features enter through a linear layer of their own before each of the first `injections` blocks. With 3 of 5
     blocks this is pixelNeRF's network; with 1 of 6 it is VisionNeRF's, as a layer over inputs that are put side by side
@@ -70,22 +70,22 @@ class ResidualMLP(nn.Module):
         direction: Float[Tensor, "*points 3"],
         features: Float[Tensor, "*points channels"],
     ) -> tuple[Float[Tensor, "*points 3"], Float[Tensor, "*points"]]:
-        """Colour in [0, 1], and density per unit of the frustum's depth, both fp32."""
+        """Return colour in [0, 1], and density per unit of the frustum's depth, both fp32."""
         weight, bias = self.injection()
-        return self.given(position, direction, F.linear(features, weight, bias))
+        return self.from_injected(position, direction, F.linear(features, weight, bias))
 
     def injection(self) -> tuple[Float[Tensor, "injected channels"], Float[Tensor, "injected"]]:
-        """Weight and bias of the layers that take the features, one below the other."""
+        """Return weight and bias of the layers that take the features, one below the other."""
         weights, biases = ([getattr(layer, name) for layer in self.features] for name in ("weight", "bias"))
         return torch.cat(weights), torch.cat(biases)
 
-    def given(
+    def from_injected(
         self,
         position: Float[Tensor, "*points 3"],
         direction: Float[Tensor, "*points 3"],
         injected: Float[Tensor, "*points injected"],
     ) -> tuple[Float[Tensor, "*points 3"], Float[Tensor, "*points"]]:
-        """As a call, given what the layers of `injection` make of the features."""
+        """Return colour and density as `forward` does, given the outputs of the `injection` layers."""
         h = self.position(torch.cat([self.encoded(position), direction], -1))
         shares = injected.chunk(len(self.features), -1)
         for number, block in enumerate(self.blocks):
@@ -95,7 +95,7 @@ class ResidualMLP(nn.Module):
         return activated(self.output(F.relu(h)), self.density_shift, self.density_scale)
 
     def encoded(self, position: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points encoding"]:
-        """The position itself, then sines and cosines of its coordinates at all frequencies, in fp32."""
+        """Return the position, then sines and cosines of its coordinates at all frequencies, in fp32."""
         octaves = torch.arange(self.frequencies, device=position.device)
         with full_precision(position.device):
             angles = (position[..., None, :] * (self.first_frequency * 2.0**octaves)[:, None]).flatten(-2)
@@ -103,7 +103,7 @@ class ResidualMLP(nn.Module):
 
 
 def _he(layer: nn.Linear) -> nn.Linear:
-    """pixelNeRF's initial weights."""
+    """Set pixelNeRF's initial weights."""
     nn.init.kaiming_normal_(layer.weight)
     nn.init.zeros_(layer.bias)
     return layer

@@ -1,4 +1,4 @@
-"""Image features of a ResNet, from several of its depths: pixelNeRF's encoder (Yu et al. 2021, section 4.1 and B.1)."""
+"""Image features of a ResNet, from several of its depths: pixelNeRF's encoder (arXiv 2012.02190, 4.1 and B.1)."""
 
 from collections.abc import Sequence
 
@@ -14,8 +14,8 @@ from nerfdiff.utils.errors import ConfigError
 class ResNetPyramid(nn.Module):
     """A ResNet without its head, its levels resized to the first one's resolution and put side by side.
 
-    No weights are downloaded. Without those there is no reason for BatchNorm, whose images depend on their company;
-    GroupNorm is what pixelNeRF offers instead.
+    No weights are downloaded. Without those there is no reason for BatchNorm, where images of a batch depend on each
+    other; pixelNeRF's alternative is GroupNorm.
 
     Args:
         channels: of the first convolution and of each stage after it; pixelNeRF takes the first three of ResNet-34.
@@ -47,7 +47,7 @@ class ResNetPyramid(nn.Module):
         he_convolutions(self)
 
     def forward(self, image: Float[Tensor, "batch 3 _h _w"]) -> Float[Tensor, "batch out_channels height width"]:
-        """Features of images in [-1, 1], of the first convolution's resolution."""
+        """Return features of images in [-1, 1], of the first convolution's resolution."""
         h = F.relu(self.norm(self.conv(image)))
         levels = [h]
         h = self.pool(h)
@@ -58,7 +58,7 @@ class ResNetPyramid(nn.Module):
 
 
 def residual_stage(channels: int, out: int, blocks: int, stride: int, groups: int) -> nn.Sequential:
-    """`blocks` residual blocks, of which the first changes channels and resolution."""
+    """Build `blocks` residual blocks, of which the first changes channels and resolution."""
 
     def norm(width: int) -> nn.GroupNorm:
         return nn.GroupNorm(groups, width)
@@ -71,19 +71,19 @@ def residual_stage(channels: int, out: int, blocks: int, stride: int, groups: in
 
 
 def side_by_side(levels: Sequence[Tensor], size: Sequence[int]) -> Float[Tensor, "batch channels height width"]:
-    """Feature maps resized to one size, their edges staying where they are, and concatenated."""
+    """Resize feature maps to one size, edges aligned, and concatenate them."""
     resized = [F.interpolate(level, size=tuple(size), mode="bilinear", align_corners=False) for level in levels]
     return torch.cat(resized, 1)
 
 
 def he_convolutions(module: nn.Module) -> None:
-    """torchvision's initial weights of a ResNet's convolutions."""
+    """Set torchvision's initial weights of a ResNet's convolutions."""
     for part in module.modules():
         if isinstance(part, nn.Conv2d):
             nn.init.kaiming_normal_(part.weight, mode="fan_out", nonlinearity="relu")
 
 
 def check_groups(groups: int, channels: Sequence[int]) -> None:
-    """Raises ConfigError unless GroupNorm can split all of `channels`."""
+    """Raise ConfigError unless GroupNorm can split all of `channels`."""
     if groups < 1 or any(width % groups for width in channels):
         raise ConfigError(f"model.field.encoder.groups={groups} must divide {', '.join(map(str, channels))} channels")

@@ -35,7 +35,7 @@ class Triplane:
 
     @staticmethod
     def join(triplanes: Sequence["Triplane"]) -> "Triplane":
-        """Triplanes of one size, one after the other in one batch."""
+        """Join triplanes of one size into one batch."""
         planes, near, far = (torch.cat([getattr(t, name) for t in triplanes]) for name in ("planes", "near", "far"))
         return Triplane(planes, Cameras.join([t.cameras for t in triplanes]), near, far)
 
@@ -48,7 +48,7 @@ class Triplane:
     def sample(
         self, points: Float[Tensor, "batch n 3"]
     ) -> tuple[Float[Tensor, "batch n channels"], Bool[Tensor, "batch n"]]:
-        """ξ_W at points of the input camera's space, and where it is defined.
+        """Return ξ_W at points of the input camera's space, and where it is defined.
 
         Outside the frustum's sides and back the border features continue. Coordinates and interpolation weights
         stay fp32: in bf16 they are off by up to an eighth of a texel on a plane of 128.

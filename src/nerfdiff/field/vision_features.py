@@ -1,4 +1,4 @@
-"""Image features of a transformer and of convolutions beside it: VisionNeRF's encoder (Lin et al. 2023)."""
+"""Image features of a transformer and of convolutions beside it: VisionNeRF's encoder (arXiv 2207.05736)."""
 
 from collections.abc import Mapping, Sequence
 
@@ -13,7 +13,7 @@ from nerfdiff.utils.errors import ConfigError
 
 
 class Reassembled(nn.Module):
-    """Tokens of one depth as a feature map (Ranftl et al. 2021): the class token read out into all, then resized.
+    """Tokens of one depth as a feature map (DPT, arXiv 2103.13413): the class token read out into all, then resized.
 
     Args:
         width: of the tokens.
@@ -44,8 +44,8 @@ class Reassembled(nn.Module):
 class VisionFeatures(nn.Module):
     """Half of the features from a ViT's tokens of four depths, for what is global, half from convolutions, for detail.
 
-    No weights are downloaded; the convolutions have GroupNorm for BatchNorm, so that images do not depend on their
-    company.
+    No weights are downloaded; the convolutions have GroupNorm instead of BatchNorm, so that images of a batch do not
+    depend on each other.
 
     Args:
         transformer: arguments of `VisionTransformer`, with four taps.
@@ -92,7 +92,7 @@ class VisionFeatures(nn.Module):
         he_convolutions(self.convolutions)
 
     def forward(self, image: Float[Tensor, "batch 3 _h _w"]) -> Float[Tensor, "batch out_channels height width"]:
-        """Features of images in [-1, 1]."""
+        """Return features of images in [-1, 1]."""
         local = self.convolutions(image)
         tapped = zip(self.depths, self.transformer(image), strict=True)
         maps = [depth(tokens, readout) for depth, (tokens, readout) in tapped]

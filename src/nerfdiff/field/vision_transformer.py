@@ -1,4 +1,4 @@
-"""The vision transformer of VisionNeRF (Dosovitskiy et al. 2021, as used by Lin et al. 2023)."""
+"""The vision transformer of VisionNeRF (ViT, arXiv 2010.11929, as in arXiv 2207.05736)."""
 
 from collections.abc import Sequence
 
@@ -65,7 +65,7 @@ class VisionTransformer(nn.Module):
     def forward(
         self, image: Float[Tensor, "batch 3 height width"]
     ) -> list[tuple[Float[Tensor, "batch channels rows columns"], Float[Tensor, "batch channels"]]]:
-        """At each tap the patches' tokens as a map, and the class token."""
+        """Return, at each tap, the patches' tokens as a map, and the class token."""
         size = [-(-side // self.patch) * self.patch for side in image.shape[-2:]]
         if size != list(image.shape[-2:]):
             image = F.interpolate(image, size=size, mode="bilinear", align_corners=False)
@@ -81,7 +81,7 @@ class VisionTransformer(nn.Module):
         return tapped
 
     def positions_for(self, rows: int, columns: int) -> Float[Tensor, "1 tokens width"]:
-        """The position embedding, resized."""
+        """Resize the position embedding."""
         own, grid = self.positions[:, :1], self.positions[:, 1:].mT.unflatten(2, (self.grid, self.grid))
         if (rows, columns) != (self.grid, self.grid):
             grid = F.interpolate(grid, size=(rows, columns), mode="bilinear", align_corners=False)

@@ -17,28 +17,28 @@ from nerfdiff.utils.memory import free_memory
 log = logging.getLogger(__name__)
 
 WARM_UP = 3
-"""Steps before one is recorded: kernels are chosen and Adam's state is made in the first."""
+"""Steps before one is recorded: the first ones choose kernels and make Adam's state."""
 
 
 class InnerSteps:
-    """Steps of an optimizer on rays drawn over all views of each scene.
+    """Take optimizer steps on random rays of all views of each scene.
 
-    All that is random is drawn before the first step, and nothing in between waits for the device: on a GPU a step
+    All random numbers are drawn before the first step, and nothing in between waits for the device: on a GPU a step
     is recorded once as a CUDA graph and replayed, since launching its kernels takes longer than they do.
 
     Args:
-        field: of one or several scenes; each fits its own part of it, whatever the others do.
-        renderer: that shows it.
-        batches: rays and colours; and, where they are remembered, the coarse weights that importance samples are drawn
-            from instead of new ones.
+        field: of one or several scenes; each fits its own part of it, independently of the others.
+        renderer: of the field.
+        batches: rays and colours; and, where they are kept, the coarse weights that importance samples are drawn from
+            instead of new ones.
         optimizer: of the field's parameters; `capturable` where steps are to be recorded.
         rays: B, per step and scene.
-        generators: one per scene, so that a scene's rays do not depend on its company.
+        generators: one per scene, so that a scene's rays do not depend on the other scenes.
         record: replay a CUDA graph, on a GPU.
     """
 
     recording = True
-    """Whether this process can record: what failed once is not tried again for every scene."""
+    """False once recording failed in this process: it is not tried again for every scene."""
 
     def __init__(
         self,
@@ -58,16 +58,16 @@ class InnerSteps:
 
     @property
     def queries(self) -> int:
-        """Points of one scene at which a step evaluates its field."""
+        """Number of points of one scene at which a step evaluates its field."""
         return self.rays * self.renderer.samples_per_ray
 
     @property
     def recorded(self) -> bool:
-        """Whether steps are replayed from a CUDA graph."""
+        """True if steps are replayed from a CUDA graph."""
         return self._graph is not None
 
     def run(self, steps: int) -> Float[Tensor, "{steps} scenes"]:
-        """Take `steps` steps; the mean squared error of each, before it."""
+        """Take `steps` steps; return the mean squared error of each, before it."""
         self._draw(steps)
         taken = 0
         if self._record and self._graph is None and steps > WARM_UP:
@@ -78,7 +78,7 @@ class InnerSteps:
         return self._losses.clone()
 
     def _draw(self, steps: int) -> None:
-        """Which rays, and where on them: into the same memory every time, which a recorded step reads."""
+        """Draw rays and samples on them into the same memory every time, which a recorded step reads."""
         scenes, per_scene = self.batches.shape
         device = self.field.planes.device
         if steps != self._steps:
@@ -94,7 +94,7 @@ class InnerSteps:
         self._number.zero_()
 
     def _require_memory(self, needed: int, device: torch.device) -> None:
-        """Before the system kills a process that it promised more than there is."""
+        """Raise OutOfMemory before the system kills the process for memory that is not there."""
         free = free_memory(device)
         if needed > free:
             raise OutOfMemory(
@@ -103,7 +103,7 @@ class InnerSteps:
             )
 
     def _step(self) -> None:
-        """The step whose number is on the device."""
+        """Take the step whose number is on the device."""
         picked, jitter = (drawn.index_select(1, self._number)[:, 0] for drawn in (self._picked, self._jitter))
         rays, colours = self.batches.at(picked)
         rgb = self.renderer.render(self.field.field(), rays, jitter, self.batches.coarse_at(picked)).rgb
@@ -115,7 +115,7 @@ class InnerSteps:
         self._number += 1
 
     def _warm_up(self) -> int:
-        """The first steps, on a stream of their own, as CUDA graphs ask; how many."""
+        """Take the first steps on a stream of their own, as CUDA graphs need; return how many."""
         here, aside = torch.cuda.current_stream(), torch.cuda.Stream()
         aside.wait_stream(here)
         with torch.cuda.stream(aside):

@@ -8,11 +8,11 @@ from nerfdiff.cameras import Cameras
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.field import TriplaneField
 from nerfdiff.field.triplane import Triplane
-from nerfdiff.render.renderer import Renderer, Rendering
+from nerfdiff.render.renderer import RenderedViews, Renderer
 
 
 class RefinedField(nn.Module):
-    """W and f_θ of one scene, or of several with a decoder each, copied, so that fitting them changes nothing else.
+    """Hold copies of W and f_θ of one scene, or of several with a decoder each, as parameters to fit.
 
     Args:
         triplane: of a batch of scenes.
@@ -32,20 +32,20 @@ class RefinedField(nn.Module):
 
     @property
     def cameras(self) -> Cameras:
-        """The input cameras [scenes], in whose space points are given."""
+        """Input cameras [scenes], in whose space points are given."""
         return Cameras(torch.eye(4, device=self.K.device).expand(len(self), 4, 4), self.K, *self._size)
 
     @property
     def triplane(self) -> Triplane:
-        """W."""
+        """The triplane W."""
         return Triplane(self.planes, self.cameras, self.near, self.far)
 
     def field(self) -> TriplaneField:
-        """Colour and density of points in the input camera's space."""
+        """Return the radiance field, in the input camera's space."""
         return TriplaneField(self.triplane, self.decoder)
 
-    def render(self, renderer: Renderer, cameras: Cameras, keep_coarse: bool = False) -> Rendering:
-        """Whole images of cameras [scenes, views]: leading shape [scenes, views, height, width].
+    def render(self, renderer: Renderer, cameras: Cameras, keep_coarse: bool = False) -> RenderedViews:
+        """Render whole images of cameras [scenes, views].
 
         Args:
             keep_coarse: as `Renderer.render`'s.
@@ -53,30 +53,30 @@ class RefinedField(nn.Module):
         return renderer.render_views(self.field(), cameras, self.near, self.far, keep_coarse=keep_coarse)
 
     def alone(self, scene: int) -> "RefinedField":
-        """One scene's field, copied."""
+        """Return a copy of one scene's field."""
         own = slice(scene, scene + 1)
         triplane = Triplane(self.planes[own], self.cameras[own], self.near[own], self.far[own])
         return RefinedField(triplane, self.decoder.of_scene(scene))
 
     @torch.no_grad()
     def snapshot(self) -> dict[str, Tensor]:
-        """A copy of the parameters, to return to with `restore`."""
+        """Return a copy of the parameters, for `restore`."""
         return {name: value.detach().clone() for name, value in self.named_parameters()}
 
     @torch.no_grad()
     def restore(self, snapshot: dict[str, Tensor], scenes: Bool[Tensor, "scenes"]) -> None:
-        """Put the parameters of those scenes back to what they were."""
+        """Set the parameters of those scenes to the snapshot's."""
         chosen = choose(scenes, snapshot, self.snapshot())
         for name, value in self.named_parameters():
             value.copy_(chosen[name])
 
     def finite(self) -> Bool[Tensor, "scenes"]:
-        """Of which scenes every parameter is a number."""
+        """Return true for each scene whose parameters are all finite."""
         return torch.stack([torch.isfinite(value).reshape(len(self), -1).all(1) for value in self.parameters()]).all(0)
 
 
 def choose(scenes: Bool[Tensor, "scenes"], snapshot: dict[str, Tensor], other: dict[str, Tensor]) -> dict[str, Tensor]:
-    """One snapshot's parameters for those scenes, another's for the rest; the device decides, and nobody waits."""
+    """Take one snapshot's parameters for those scenes, another's for the rest, without waiting for the device."""
     # a parameter's first axis is the scenes' where there are several
     flags = {name: scenes.reshape(-1, *[1] * (value.ndim - 1)) for name, value in snapshot.items()}
     return {name: torch.where(flags[name], value, other[name]) for name, value in snapshot.items()}

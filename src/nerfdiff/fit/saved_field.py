@@ -1,4 +1,4 @@
-"""A refined field on disk: safetensors, with the camera it lives in and all else that rendering it takes."""
+"""A refined field on disk: safetensors, with its input camera and all else that rendering needs."""
 
 import hashlib
 import json

@@ -111,11 +111,11 @@ class Consistency:
         fresh = self._fresh(source, *bounds, (self.seed, "consistency", scene_id))
         renderer = Renderer(self.uniform_samples, self.importance_samples, self.background, self.chunk)
         batches = RayBatches(cameras[fitted][None], *bounds)
-        batches.paint(dequantise(pixels[fitted])[None])
+        batches.set_colours(dequantise(pixels[fitted])[None])
         with torch.enable_grad():
             self._fit(fresh, renderer, batches, generator(device, self.seed, "consistency", scene_id, "rays"))
         with torch.no_grad():
-            rendered = fresh.render(renderer, cameras[held_out][None]).rgb[0].movedim(-1, 1)
+            rendered = fresh.render(renderer, cameras[held_out][None]).images[0]
         return psnr(rendered.clamp(0, 1), dequantise(pixels[held_out])).mean().item()
 
     def _fresh(self, source: Cameras, near: Tensor, far: Tensor, seed: tuple[int | str, ...]) -> RefinedField:

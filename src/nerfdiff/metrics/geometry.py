@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras, Rays
-from nerfdiff.field.field import FieldFn
+from nerfdiff.field.field import Field
 from nerfdiff.render.renderer import Renderer
 
 # Density that dims a ray by less than this between near and far is not worth looking up.
@@ -35,7 +35,7 @@ def outside_hull(
 
 @torch.no_grad()
 def floaters(
-    field: FieldFn,
+    field: Field,
     renderer: Renderer,
     cameras: Cameras,
     silhouettes: Bool[Tensor, "views h w"],
@@ -66,9 +66,9 @@ def floaters(
         return None
     widened = F.max_pool2d(silhouettes[:, None].float(), 2 * margin + 1, stride=1, padding=margin)[:, 0] > 0
 
-    def outside(points: Tensor) -> tuple[Tensor, Tensor]:
+    def outside(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """The field, with "is outside" as its colour."""
-        _, density = field(points)
+        _, density = field(points, directions)
         visible = density * (far - near) > INVISIBLE
         flags = torch.zeros_like(density)
         flags[visible] = outside_hull(points[visible], cameras, widened).to(flags)

@@ -1,4 +1,4 @@
-"""Whether this device's kernels show what the reference shows: looked at once, before they are trusted."""
+"""Check once, before fused kernels are used on a device, that they render what the reference renders."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -16,11 +16,11 @@ from nerfdiff.field.field import TriplaneField
 from nerfdiff.field.triplane import Triplane
 
 SCENES, RAYS = 2, 64
-"""That are compared, at most: the first scenes, and of each, rays spread evenly over those to render."""
+"""Compared at most: the first scenes, and of each, rays spread evenly over those to render."""
 OPTICAL_DEPTH = 4.0
-"""Of the probe's frustum, about: most of what is seen is in front, so importance samples are not uniform ones."""
+"""Optical depth of the probe's frustum, about: its front is the most visible, so importance samples are not uniform."""
 CONTRAST = 0.5
-"""Of the probe's densities, before the softplus: no gaps, over which rounding would make importance samples jump."""
+"""Contrast of the probe's densities before the softplus; gaps would let rounding move importance samples far."""
 
 # Three and a half times or more what rounding did in the worst case to probes of nine sizes and five seeds seen by 64
 # rays (decoders under bf16 autocast or not, planes rounded to bf16 or not) and of four sizes in Triton's interpreter:
@@ -38,9 +38,9 @@ GRADIENTS = {
     "origins": 0.7,
     "directions": 0.7,
 }
-"""Likewise of gradients, in lengths of the reference's."""
+"""Differences of gradients above which kernels are not trusted, in lengths of the reference's gradient."""
 NOTHING = 1e-5
-"""Length below which a gradient is taken for rounding; those of 64 rays were of 5e-3 to 10 where not nothing."""
+"""Length below which a gradient counts as rounding; those of 64 rays were 5e-3 to 10 where not zero."""
 
 # field, rays, jitter, coarse weights -> colours, opacity, depth
 Render = Callable[
@@ -51,14 +51,14 @@ Render = Callable[
 
 @dataclass(frozen=True)
 class Probe:
-    """A random field and rays through it, of the sizes and types of what is to be rendered.
+    """A random field and rays through it, of the sizes and types of those to be rendered.
 
-    A field to render may show nothing (importance samples are uniform ones then), or be so
-    sharp that rounding shows. This one tells kernels that are wrong from those that round, whatever is rendered.
+    A field to render may be empty (importance samples are then uniform), or so sharp that rounding shows. This one
+    tells wrong kernels from rounding in any case.
 
     Args:
         jitter, coarse: as of `Renderer.render`.
-        leaves: those tensors by name of which gradients are compared.
+        leaves: tensors by name whose gradients are compared.
     """
 
     field: TriplaneField
@@ -76,11 +76,11 @@ class Probe:
         samples: int,
         needs: Sequence[bool],
     ) -> "Probe":
-        """One for this field and some of these rays.
+        """Make a probe like this field and some of these rays.
 
         Args:
             samples: per ray; the field varies from sample to sample, so that it shows where they are.
-            needs: whether planes, decoder and rays are to have gradients.
+            needs: true for planes, decoder and rays if they are to have gradients.
         """
         device, count = rays.near.device, rays.near.shape[1]
         source = torch.Generator(device).manual_seed(0)  # a run's own random numbers stay as they are
@@ -106,21 +106,21 @@ class Probe:
             leaf.requires_grad_()
         return Probe(TriplaneField(triplane, decoder), few, drawn(jitter, 1), drawn(coarse, 4), leaves)
 
-    def look(self, render: Render) -> dict[str, Tensor]:
-        """Colours, opacities and depths (of the rays' lengths), and gradients of a sum of them with random weights."""
+    def outputs(self, render: Render) -> dict[str, Tensor]:
+        """Return colours, opacities and depths (of the rays' lengths), and gradients of a randomly weighted sum."""
         with torch.set_grad_enabled(bool(self.leaves)):
             colours, opacity, depth = render(self.field, self.rays, self.jitter, self.coarse)
-            seen = dict(zip(VALUES, (colours, opacity, depth / (self.rays.far - self.rays.near)), strict=True))
+            values = dict(zip(VALUES, (colours, opacity, depth / (self.rays.far - self.rays.near)), strict=True))
         if not self.leaves:
-            return seen
+            return values
         source = torch.Generator(depth.device).manual_seed(1)
-        weights = [torch.rand(v.shape, device=v.device, generator=source) / depth.numel() for v in seen.values()]
-        gradients = torch.autograd.grad(list(seen.values()), list(self.leaves.values()), weights)
-        return {name: v.detach() for name, v in seen.items()} | dict(zip(self.leaves, gradients, strict=True))
+        weights = [torch.rand(v.shape, device=v.device, generator=source) / depth.numel() for v in values.values()]
+        gradients = torch.autograd.grad(list(values.values()), list(self.leaves.values()), weights)
+        return {name: v.detach() for name, v in values.items()} | dict(zip(self.leaves, gradients, strict=True))
 
 
 def disagreement(found: dict[str, Tensor], expected: dict[str, Tensor]) -> str | None:
-    """How what kernels show differs from what the reference shows by more than rounding does; None where it does not.
+    """Say how the kernels' outputs differ from the reference's by more than rounding; None where they do not.
 
     Waits for the device.
     """
@@ -142,7 +142,7 @@ def disagreement(found: dict[str, Tensor], expected: dict[str, Tensor]) -> str |
 
 @contextmanager
 def in_any_order() -> Iterator[None]:
-    """Sums need not come in a fixed order: on a GPU the reference knows no other way, and raises where it is asked."""
+    """Allow sums in any order: on a GPU the reference has no other way, and raises where determinism is asked."""
     before = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
     torch.use_deterministic_algorithms(False)
     try:
@@ -152,7 +152,7 @@ def in_any_order() -> Iterator[None]:
 
 
 def _random_triplane(like: Triplane, samples: int, source: torch.Generator) -> Triplane:
-    """Noise that is as fine as samples along a ray, or as the planes are."""
+    """Make noise as fine as the samples along a ray, or as the planes."""
     some = slice(SCENES)
     shape, device = like.planes[some].shape, like.planes.device
     cells = [min(samples, side) for side in shape[-2:]]

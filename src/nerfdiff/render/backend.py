@@ -1,4 +1,4 @@
-"""Which renderer: the fused kernels where they can do the same as the PyTorch reference, else the reference."""
+"""The choice of the renderer: fused kernels where they can do the same as the PyTorch reference, else the reference."""
 
 import logging
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nerfdiff.cameras import Rays
 from nerfdiff.field.decoder import Decoder
-from nerfdiff.field.field import FieldFn, TriplaneField
+from nerfdiff.field.field import Field, TriplaneField
 from nerfdiff.render.agreement import Probe, disagreement, in_any_order
 from nerfdiff.render.reference_gradients import reference_gradients
 from nerfdiff.utils.errors import ConfigError
@@ -38,15 +38,15 @@ _POINTS_PER_QUERY = 16
 """The kernels keep 40 bytes of a sample where the reference's backward pass keeps 0.8 kB of a point."""
 
 _COMPARED = ("cuda",)
-"""Devices on which kernels are looked at before they are trusted. The interpreter's are tested beforehand."""
+"""Devices on which kernels are compared with the reference first. The interpreter's are tested beforehand."""
 
-_told: set[str] = set()
+_warned: set[str] = set()
 _failures: dict[tuple, str] = {}
 _trusted: set[tuple] = set()
 
 
 def check_choice(backend: str, kernel_precision: str) -> None:
-    """Raises ConfigError unless both are known."""
+    """Raise ConfigError unless both are known."""
     known = (("backend", backend, BACKENDS), ("kernel_precision", kernel_precision, PRECISIONS))
     for name, choice, choices in known:
         if choice not in choices:
@@ -56,13 +56,13 @@ def check_choice(backend: str, kernel_precision: str) -> None:
 @torch.compiler.disable
 def fused(
     renderer,
-    field: FieldFn,
+    field: Field,
     rays: Rays,
     jitter: Float[Tensor, "batch n samples"] | None,
     coarse: Float[Tensor, "batch n bins"] | None = None,
     keep_coarse: bool = False,
 ) -> Outputs | None:
-    """The values of a `Rendering` by the fused kernels; None where the reference has to render.
+    """Render by the fused kernels: the values of a `Rendering`; None where the reference has to render.
 
     `auto` takes the kernels for triplane fields on a GPU. Where they were wanted and cannot run, one line says why,
     once for each reason.
@@ -77,30 +77,30 @@ def fused(
     )
     if not isinstance(found, str):
         return found
-    _tell(found)
+    _warn_once(found)
     return None
 
 
-def chosen(renderer, field: FieldFn, rays: Rays) -> str:
-    """What renders these rays, `torch` or `triton`; certain once they were rendered, as kernels may not compile."""
+def chosen(renderer, field: Field, rays: Rays) -> str:
+    """Return what renders these rays, `torch` or `triton`; certain after rendering, as kernels may not compile."""
     fits = _wanted(renderer, field, rays) and _obstacle(renderer, field, rays, None, None) is None
     return "triton" if fits else "torch"
 
 
-def _wanted(renderer, field: FieldFn, rays: Rays) -> bool:
+def _wanted(renderer, field: Field, rays: Rays) -> bool:
     if renderer.backend == "auto":
         return rays.near.is_cuda and isinstance(field, TriplaneField)
     return renderer.backend == "triton"
 
 
-def _tell(reason: str) -> None:
-    if reason not in _told:
-        _told.add(reason)
+def _warn_once(reason: str) -> None:
+    if reason not in _warned:
+        _warned.add(reason)
         log.warning("no fused rendering, the PyTorch reference takes over: %s", reason)
 
 
 def _attempt(renderer, field: TriplaneField, kernels: Callable[[], Any]) -> Any:
-    """What kernels give; where they fail, why."""
+    """Call kernels; return their values, or where they fail the reason."""
     try:
         return kernels()
     except torch.OutOfMemoryError:
@@ -110,7 +110,7 @@ def _attempt(renderer, field: TriplaneField, kernels: Callable[[], Any]) -> Any:
 
 
 def _note_failure(kind: tuple, what: str, error: Exception, device: torch.device) -> str:
-    """Remember not to try again what cannot be compiled or launched."""
+    """Note a failure, so that kernels of this kind are not tried again; return the reason."""
     if device.type == "cuda" and torch.cuda.is_current_stream_capturing():
         # what breaks the recording of a graph may well run outside of one: who records decides
         raise error
@@ -120,7 +120,7 @@ def _note_failure(kind: tuple, what: str, error: Exception, device: torch.device
 
 
 def _kind(renderer, field: TriplaneField) -> tuple:
-    """What compilation depends on."""
+    """Return the values that compilation depends on."""
     planes, weight = field.triplane.planes, field.decoder.hidden.weight
     chosen = renderer.background is None, renderer.least_transmittance > 0, _half(renderer, planes.device)
     return planes.device, planes.shape[-2:], weight.shape[-2], weight.ndim, *chosen
@@ -128,7 +128,7 @@ def _kind(renderer, field: TriplaneField) -> tuple:
 
 @cache
 def _missing() -> str | None:
-    """Why the kernels cannot be imported."""
+    """Return why the kernels cannot be imported; None where they can."""
     try:
         import nerfdiff.render.kernels.function  # noqa: F401
     except ImportError as error:
@@ -142,8 +142,8 @@ def _interpreted() -> bool:
     return INTERPRETED
 
 
-def _obstacle(renderer, field: FieldFn, rays: Rays, jitter: Tensor | None, coarse: Tensor | None) -> str | None:
-    """Why the kernels cannot render this as the reference does."""
+def _obstacle(renderer, field: Field, rays: Rays, jitter: Tensor | None, coarse: Tensor | None) -> str | None:
+    """Return why the kernels cannot render this as the reference does; None where they can."""
     if type(field) is not TriplaneField or type(field.decoder) is not Decoder:
         return "the field is not a triplane with this project's decoder"
     return (
@@ -201,14 +201,14 @@ def _tensor_obstacle(
 
 
 def _half(renderer, device: torch.device) -> bool:
-    """Whether kernels compute in halves: where the reference's products would be."""
+    """Return true if kernels compute in halves: where the reference's products would be."""
     if renderer.kernel_precision == "auto":
         return torch.is_autocast_enabled(device.type)
     return renderer.kernel_precision == "bf16"
 
 
 def _distrust(renderer, field: TriplaneField, rays: Rays, jitter, coarse, ordered: bool) -> str | None:
-    """Why kernels of this kind, about to be used for the first time, are not to be: they show something else.
+    """Compare kernels that are used for the first time with the reference; return how they differ, or None.
 
     Errors of the reference are raised, and not held against the kernels.
     """
@@ -221,11 +221,11 @@ def _distrust(renderer, field: TriplaneField, rays: Rays, jitter, coarse, ordere
     plain, values = replace(renderer, backend="torch"), attrgetter("rgb", "opacity", "depth")
     with in_any_order():
         probe = Probe.like(field, rays, jitter, coarse, renderer.samples_per_ray, needs)
-        kernels = partial(probe.look, lambda *given: _render(renderer, *given, False, ordered)[:3])
+        kernels = partial(probe.outputs, lambda *given: _render(renderer, *given, False, ordered)[:3])
         found = _attempt(renderer, field, kernels)
         if isinstance(found, str):
             return found
-        expected = probe.look(lambda *given: values(plain.render(*given)))
+        expected = probe.outputs(lambda *given: values(plain.render(*given)))
     # of a backward pass that failed, the reference's gradients were found
     reason = _failures.get(kind) or disagreement(found, expected)
     if reason is not None:
@@ -236,7 +236,7 @@ def _distrust(renderer, field: TriplaneField, rays: Rays, jitter, coarse, ordere
 
 
 def _needs(field: TriplaneField, rays: Rays) -> tuple[bool, ...]:
-    """Whether planes, decoder and rays get gradients."""
+    """Return true for planes, decoder and rays if they get gradients."""
     groups = [field.triplane.planes], field.decoder.parameters(), [rays.origins, rays.directions]
     return tuple(torch.is_grad_enabled() and any(t.requires_grad for t in group) for group in groups)
 
@@ -263,7 +263,7 @@ def _render(renderer, field: TriplaneField, rays: Rays, jitter, coarse, keep_coa
     kind = _kind(renderer, field)
 
     def recover(error, tensors, d_outputs, needed):
-        _tell(_note_failure(kind, "the backward pass", error, triplane.planes.device))
+        _warn_once(_note_failure(kind, "the backward pass", error, triplane.planes.device))
         return reference_gradients(renderer, field, settings.half, tensors, d_outputs, needed)
 
     return fused_render(

@@ -1,4 +1,4 @@
-"""Gradients by the PyTorch reference of what kernels rendered."""
+"""Gradients by the PyTorch reference for renderings of the fused kernels."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,11 +20,11 @@ def reference_gradients(
     d_outputs: Sequence[Tensor],
     needed: Sequence[bool],
 ) -> list[Tensor | None]:
-    """Of the first 7 tensors where needed, for a picture whose own backward pass failed.
+    """Compute gradients of the first 7 tensors where needed, for a rendering whose own backward pass failed.
 
     Args:
-        renderer, field: that showed it.
-        half: whether it was made in half precision.
+        renderer, field: of the rendering.
+        half: true if it was made in half precision.
         tensors: the 14 of `fused_render`.
         d_outputs: gradients of colour, opacity and depth.
     """

@@ -10,7 +10,7 @@ from torch.utils.checkpoint import checkpoint
 
 from nerfdiff.cameras import Cameras, Rays
 from nerfdiff.field import cpu_field
-from nerfdiff.field.field import FieldFn, PixelField
+from nerfdiff.field.field import Field
 from nerfdiff.render.backend import check_choice, fused
 from nerfdiff.render.sampling import (
     KEPT,
@@ -27,17 +27,17 @@ CACHED_POINTS = 2**16
 """Points at once on a CPU, whatever `chunk` allows: more leave its caches, fewer cost more calls (measured)."""
 
 PARTS = ("origins", "directions", "near", "far", "jitter", "coarse")
-"""What belongs to rays, along their axis."""
+"""Arguments with one entry per ray."""
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """What rays saw. `*rays` is the leading shape of the rays.
+    """Rendered rays. `*rays` is their leading shape.
 
     Args:
         rgb: colour over the background.
         opacity: accumulated weight in [0, 1].
-        depth: expected distance along the ray given that something was hit; `far` where nothing was.
+        depth: expected distance along the ray given a hit, in scene units; `far` where there is none.
         coarse: weights of the uniform samples, each in the middle of one of so many equal bins, from which the others
             were drawn; in half precision, and only where they are to be kept.
     """
@@ -49,8 +49,24 @@ class Rendering:
 
 
 @dataclass(frozen=True)
+class RenderedViews:
+    """Whole images; `opacity`, `depth` and `coarse` are those of a `Rendering`.
+
+    Args:
+        images: colour over the background, in [0, 1].
+    """
+
+    images: Float[Tensor, "batch views 3 height width"]
+    opacity: Float[Tensor, "batch views height width"]
+    depth: Float[Tensor, "batch views height width"]
+    coarse: Float[Tensor, "batch views height width bins"] | None = None
+
+
+@dataclass(frozen=True)
 class Renderer:
-    """Uniform, then importance samples of one and the same field, composited together.
+    """Render a field by uniform, then importance samples of it, composited together (NeRF, arXiv 2003.08934).
+
+    Unlike NeRF's, both kinds are samples of the same field.
 
     Args:
         uniform_samples, importance_samples: per ray; the paper uses 64 and 64.
@@ -93,7 +109,7 @@ class Renderer:
 
     def render(
         self,
-        field: FieldFn,
+        field: Field,
         rays: Rays,
         jitter: Float[Tensor, "batch n samples"] | None = None,
         coarse: Float[Tensor, "batch n bins"] | None = None,
@@ -131,20 +147,17 @@ class Renderer:
 
     def render_views(
         self,
-        field: FieldFn,
+        field: Field,
         cameras: Cameras,
         near: Float[Tensor, "batch"],
         far: Float[Tensor, "batch"],
         jitter: Float[Tensor, "batch n samples"] | None = None,
         keep_coarse: bool = False,
-    ) -> Rendering:
+    ) -> RenderedViews:
         """Render whole images of cameras [batch, views], given in the input cameras' space.
 
         Args:
             jitter, keep_coarse: as `render`'s.
-
-        Returns:
-            A rendering of leading shape [batch, views, height, width].
         """
         rays = cameras.rays(near[:, None], far[:, None])
         shape = torch.broadcast_shapes(rays.near.shape, rays.directions.shape[:-1])
@@ -156,7 +169,8 @@ class Renderer:
         )
         out = self.render(field, flat, jitter, keep_coarse=keep_coarse)
         coarse = None if out.coarse is None else out.coarse.reshape(*shape, -1)
-        return Rendering(out.rgb.reshape(*shape, 3), out.opacity.reshape(shape), out.depth.reshape(shape), coarse)
+        images = out.rgb.reshape(*shape, 3).movedim(-1, 2)
+        return RenderedViews(images, out.opacity.reshape(shape), out.depth.reshape(shape), coarse)
 
     def _check_coarse(self, rays, jitter, coarse, keep_coarse):
         if keep_coarse and (coarse is not None or jitter is not None):
@@ -166,7 +180,7 @@ class Renderer:
             raise ValueError(f"coarse weights of shape {tuple(coarse.shape)}, expected {expected}")
 
     def _in_chunks(self, field, parts, keep_coarse, recompute):
-        """The values of a `Rendering`, of rays split along their second axis."""
+        """Render rays split along their second axis; return the values of a `Rendering`."""
         near = parts["near"]
         points = min(self.chunk, CACHED_POINTS) if near.device.type == "cpu" else self.chunk
         per_chunk = max(1, points // (len(near) * self.samples_per_ray))
@@ -209,7 +223,7 @@ class Renderer:
         return *self._composite(rays, distances, rgb, density), *kept
 
     def _composite(self, rays, distances, rgb, density):
-        """Colour, opacity and depth."""
+        """Integrate along rays: colour, opacity and depth."""
         lengths = edges_between(distances, rays.near, rays.far).diff(dim=-1)
         weights = compositing_weights(density, lengths)
         if self.background is None:
@@ -225,21 +239,18 @@ class Renderer:
     @staticmethod
     def _query(field, rays, distances):
         points = rays.at(distances)
-        if isinstance(field, PixelField):
-            directions = rays.directions[..., None, :].expand(points.shape)
-            rgb, density = field(points.flatten(1, 2), directions.flatten(1, 2))
-        else:
-            rgb, density = field(points.flatten(1, 2))
+        directions = rays.directions[..., None, :].expand(points.shape)
+        rgb, density = field(points.flatten(1, 2), directions.flatten(1, 2))
         return rgb.reshape(*points.shape), density.reshape(points.shape[:-1])
 
 
 def _split(parts: dict[str, Tensor], size: int, axis: int) -> Iterator[dict[str, Tensor]]:
-    """All parts, so many entries of an axis at a time."""
+    """Split all parts along an axis, so many entries at a time."""
     for values in zip(*(part.split(size, axis) for part in parts.values()), strict=True):
         yield dict(zip(parts, values, strict=True))
 
 
 def _joined(outputs: Sequence[Sequence[Tensor]], axis: int) -> list[Tensor]:
-    """Value by value, what parts of the rays gave."""
+    """Join the values of parts of the rays."""
     with full_precision(outputs[0][0].device):  # autocast on a CPU cannot join halves
         return [torch.cat(values, axis) for values in zip(*outputs, strict=True)]

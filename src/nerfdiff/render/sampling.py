@@ -1,4 +1,4 @@
-"""Quadrature along a ray: uniform bins, importance samples from what they showed, and the weights of the integral."""
+"""Quadrature along a ray: uniform bins, importance samples by their weights, and the weights of the integral."""
 
 import torch
 from jaxtyping import Float
@@ -8,13 +8,13 @@ from torch.nn.functional import pad
 from nerfdiff.utils.precision import at_least_single
 
 KEPT = torch.float16
-"""Of weights that are kept for later: there are many of them, and samples fall where they do by chance anyway."""
+"""Type of kept coarse weights: there are many of them, and samples are random anyway."""
 
 
 def compositing_weights(
     density: Float[Tensor, "*rays samples"], lengths: Float[Tensor, "*rays samples"]
 ) -> Float[Tensor, "*rays samples"]:
-    """ω_i = T_i (1 − exp(−σ_i δ_i)), T_i = exp(−Σ_{j<i} σ_j δ_j) (paper, eq. "nerf").
+    """Return ω_i = T_i (1 − exp(−σ_i δ_i)), T_i = exp(−Σ_{j<i} σ_j δ_j) (paper, eq. "nerf").
 
     fp32 throughout, with T as the exponential of an exclusive cumulative sum: a bf16 cumulative product of many
     nearly transparent samples stays at 1.
@@ -26,7 +26,7 @@ def compositing_weights(
 
 
 def uniform_edges(near: Float[Tensor, "*rays"], far: Float[Tensor, "*rays"], n: int) -> Float[Tensor, "*rays {n}+1"]:
-    """The n + 1 edges of n equal bins between near and far."""
+    """Return the n + 1 edges of n equal bins between near and far."""
     steps = torch.linspace(0, 1, n + 1, dtype=near.dtype, device=near.device)
     return near[..., None] + (far - near)[..., None] * steps
 
@@ -34,7 +34,7 @@ def uniform_edges(near: Float[Tensor, "*rays"], far: Float[Tensor, "*rays"], n: 
 def in_bins(
     edges: Float[Tensor, "*rays edges"], jitter: Float[Tensor, "*rays edges-1"] | None
 ) -> Float[Tensor, "*rays edges-1"]:
-    """One distance per bin: its centre, or the place `jitter` in [0, 1) picks (stratified sampling).
+    """Return one distance per bin: its centre, or the place `jitter` in [0, 1) picks (stratified sampling).
 
     n bins have n + 1 edges.
     """
@@ -49,13 +49,13 @@ def importance_distances(
     jitter: Float[Tensor, "*rays {n}"] | None,
     floor: float = 1e-2,
 ) -> Float[Tensor, "*rays {n}"]:
-    """n distances drawn by inverse CDF from the piecewise-constant density `weights` over the bins.
+    """Draw n distances by inverse CDF from the piecewise-constant density `weights` over the bins.
 
     Args:
         edges, weights: one edge more than there are bins, and so weights.
         jitter: in [0, 1), one per drawn distance; None takes the n quantile centres.
-        floor: share of the draws spread evenly over all bins, so that a ray that met nothing (all weights zero)
-            is sampled evenly and no bin is never looked at.
+        floor: share of the samples spread evenly over all bins, so that an empty ray (all weights zero) is sampled
+            evenly and every bin has a chance.
 
     Returns:
         Ascending distances. No gradient flows through the choice of samples.
@@ -79,6 +79,6 @@ def importance_distances(
 def edges_between(
     distances: Float[Tensor, "*rays n"], near: Float[Tensor, "*rays"], far: Float[Tensor, "*rays"]
 ) -> Float[Tensor, "*rays n+1"]:
-    """Intervals that partition [near, far], one around each of these ascending distances."""
+    """Return the edges of intervals that partition [near, far], one around each of these ascending distances."""
     middle = 0.5 * (distances[..., 1:] + distances[..., :-1])
     return torch.cat([near[..., None], middle, far[..., None]], -1)

@@ -32,7 +32,7 @@ class KeptRenderings:
         self._open: sqlite3.Connection | None = None
 
     def __getstate__(self) -> dict:
-        """Without the open file, which neither a copy nor another process has."""
+        """Return the state without the open file, which neither a copy nor another process has."""
         return self.__dict__ | {"_open": None}
 
     @property
@@ -48,7 +48,7 @@ class KeptRenderings:
     def get(
         self, names: Sequence[str], size: tuple[int, int], render: Callable[[list[int]], Float[Tensor, "missing 3 h w"]]
     ) -> Float[Tensor, "names 3 height width"]:
-        """Images in [0, 1], rounded to 8 bits.
+        """Return images in [0, 1], rounded to 8 bits.
 
         Args:
             size: height and width.

@@ -1,4 +1,4 @@
-"""What a training step will take, found out on the meta device before anything is allocated."""
+"""The memory of a training step, traced on the meta device before anything is allocated."""
 
 import gc
 import logging
@@ -23,14 +23,14 @@ log = logging.getLogger(__name__)
 WEIGHTS_ADAM_EMA = 4 * 4
 """Bytes per parameter that stay: fp32 weights, Adam's two moments, the average."""
 HEADROOM = 0.85
-"""Share of what is free that is planned with, where recomputing more is the alternative to running out."""
+"""Share of the free memory that `checkpointing=auto` plans with: recomputing more is better than running out."""
 
 
 class PeakMemory(TorchDispatchMode):
     """Counts the bytes of all tensors made inside that are alive at once.
 
     Works on the meta device, where nothing is allocated; memory that an operator takes while it runs (cuDNN's and
-    attention's workspaces) is not seen.
+    attention's workspaces) is not counted.
     """
 
     def __init__(self):
@@ -65,9 +65,9 @@ class _Alive:
 
 @contextmanager
 def like_a_gpu(mixed: bool) -> Iterator[None]:
-    """The meta device doing as a GPU does: attention that keeps no weights, and bf16 as autocast brings it in.
+    """Make the meta device act as a GPU: attention that keeps no weights, and bf16 under autocast.
 
-    The meta device knows neither. What counts is which operators keep a copy in which type: as in autocast's lists,
+    The meta device has neither. What counts is which operators keep a copy in which type: as in autocast's lists,
     products take bf16, GroupNorm takes fp32, and a parameter is cast once for all. The functions themselves are
     exchanged, as a TorchFunctionMode rests during the backward pass, where checkpointing needs it.
     """
@@ -109,8 +109,8 @@ def like_a_gpu(mixed: bool) -> Iterator[None]:
 
 @contextmanager
 def no_garbage_collection() -> Iterator[None]:
-    """Whoever traces sees the same each time, and the most: checkpointing leaves cycles that hold tensors, and which
-    of them Python collects in time depends on all that ran before.
+    """Make traces repeatable, and the largest possible: checkpointing leaves cycles that hold tensors, and which of
+    them Python collects in time depends on all that ran before.
     """
     enabled = gc.isenabled()
     gc.disable()
@@ -160,7 +160,7 @@ def training_memory(
 def largest_batch(
     model_config: Mapping, memory: int, target_views: int, height: int, width: int, precision: str
 ) -> int:
-    """Draws that pass through a device of so many bytes at once; 0 where not even one fits.
+    """Return how many draws pass through a device of so many bytes at once; 0 where not even one fits.
 
     Args:
         model_config, target_views, height, width, precision: as for `training_memory`.
@@ -174,7 +174,7 @@ def largest_batch(
         return totals[batch]
 
     def line(one: int, other: int) -> int:
-        """Where the straight line through two batches reaches the memory."""
+        """Return where the straight line through two batches reaches the memory."""
         per_draw = max(1, (total(other) - total(one)) // (other - one))
         return one + (memory - total(one)) // per_draw
 
@@ -199,15 +199,15 @@ def _step(model: NerfDiff, batch_size: int, target_views: int, height: int, widt
     views = Cameras(c2w, K, height, width)
     jitter = torch.empty(batch_size, target_views * height * width, model.renderer.samples_per_ray)
 
-    encoding = model.encode(source, cameras, bounds, bounds)
+    encoding = model.encode_images(source, cameras, bounds, bounds)
     rendering = model.render(encoding, views, jitter)
-    condition = model.condition(encoding, views, rendering.rgb.movedim(-1, 2))
+    condition = model.condition(encoding, views, rendering.images)
     velocity = model.denoiser.velocity(targets, targets.new_empty(len(targets)), condition)
     (F.mse_loss(condition.rendered, targets) + F.mse_loss(velocity, targets)).backward()
 
 
 def is_tight(model_config: Mapping, device: torch.device) -> bool:
-    """Whether the state alone takes a quarter of what is free, so that a step is worth tracing."""
+    """Return true if the state alone takes a quarter of the free memory, so that a step is worth tracing."""
     parameters = sum(p.numel() for p in build_on_meta(model_config).parameters())
     return 4 * WEIGHTS_ADAM_EMA * parameters >= free_memory(device)
 
@@ -221,8 +221,9 @@ def within_memory(
     width: int,
     precision: str,
 ) -> dict:
-    """The settings with which a run fits: `unet.checkpointing=auto` becomes as little recomputing as memory asks for,
-    and a run that the device cannot hold is refused before hours or the machine are lost to it.
+    """Return settings that fit the memory: `unet.checkpointing=auto` becomes as little recomputing as it allows.
+
+    A run that the device cannot hold is refused before it begins.
 
     Args:
         model_config, batch_size, precision: as for `training_memory`.
@@ -238,21 +239,21 @@ def within_memory(
         # the largest images first: they hold the most, and cost no more to compute anew
         choices = [False, *(most[: count + 1] for count in range(len(most) - 1)), True]
     for choice in choices:
-        settled = dict(model_config) | {"unet": dict(unet) | {"checkpointing": choice}}
-        needed = training_memory(settled, batch_size, target_views, height, width, precision)
+        fitting = dict(model_config) | {"unet": dict(unet) | {"checkpointing": choice}}
+        needed = training_memory(fitting, batch_size, target_views, height, width, precision)
         if needed.total <= free * (HEADROOM if automatic else 1):
             break
     state, step, available = (amount / 2**30 for amount in (needed.state, needed.step, free))
-    told = (
+    message = (
         f"training takes about {state + step:.1f} GiB: {state:.1f} of weights, Adam and EMA, and {step:.1f} "
         f"of gradients and activations for {batch_size} x {height}x{width} at once; {device.type} has "
         f"{available:.1f} GiB free"
     )
     if needed.total > free:
         raise ConfigError(
-            f"{told}. Choose a smaller model or more memory; trainer.accumulate_grad_batches=N passes the batch "
+            f"{message}. Choose a smaller model or more memory; trainer.accumulate_grad_batches=N passes the batch "
             "through in N parts, model.unet.checkpointing=true (or, say, [1,2]: where images are as large as the input "
             "or half) and a smaller model.render.chunk recompute more and keep less"
         )
-    log.info("%s", f"{told} (model.unet.checkpointing={choice})" if automatic else told)
-    return settled
+    log.info("%s", f"{message} (model.unet.checkpointing={choice})" if automatic else message)
+    return fitting

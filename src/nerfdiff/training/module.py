@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -28,10 +29,11 @@ from nerfdiff.results.environment import git_state
 from nerfdiff.training.callbacks.progress import share_of_time, timer_of
 from nerfdiff.training.kept_renderings import KeptRenderings
 from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.images import to_signed
 from nerfdiff.utils.randomness import generator, spread_times
 
 WHOLE = {"ray_share": 1.0, "through_rendering": True}
-"""The paper's joint loss, which checkpoints from before there was another have."""
+"""The paper's joint loss; checkpoints from before there was another have no such settings."""
 
 
 class NerfDiffModule(LightningModule):
@@ -49,6 +51,7 @@ class NerfDiffModule(LightningModule):
         channels_last: memory layout of the U-Nets.
         seed: of all noise; see `nerfdiff.utils.randomness`.
         kept_renderings: folder where a frozen field's renderings are kept, instead of being made at every step.
+        renderer: `backend` and `kernel_precision` of the `Renderer`, which suit a machine and are not saved.
 
     Raises:
         ConfigError: losses that train nothing, or that ask for gradients which are not computed.
@@ -63,12 +66,13 @@ class NerfDiffModule(LightningModule):
         channels_last: bool,
         seed: int,
         kept_renderings: str | None = None,
+        renderer: Mapping = MappingProxyType({}),
     ):
         super().__init__()
         losses = WHOLE | losses
         _check_losses(losses, kept_renderings)
-        self.save_hyperparameters(ignore=["kept_renderings"])
-        self.model = NerfDiff(**model)
+        self.save_hyperparameters(ignore=["kept_renderings", "renderer"])
+        self.model = NerfDiff(**model | {"render": {**model["render"], **renderer}})
         self.frozen_field = losses["lambda_ic"] == 0
         self._kept_folder, self._kept = kept_renderings, None
         self.begun_from: str | None = None  # SHA-256 of `init`'s weights
@@ -85,13 +89,15 @@ class NerfDiffModule(LightningModule):
     def training_step(self, batch: ViewBatch, batch_idx: int) -> Tensor:
         self.image_size = list(batch.targets.shape[-2:])
         losses = WHOLE | self.hparams.losses
-        encode = torch.no_grad() if self.frozen_field else nullcontext()
-        with encode:
-            encoding = self.model.encode(batch.source, batch.source_cameras, batch.near, batch.far)
+        # encode the source views
+        with torch.no_grad() if self.frozen_field else nullcontext():
+            encoding = self.model.encode(batch)
+        # render the targets: L^IC
         noise = self._noise(batch, losses)
         loss_ic, rendering = self._photometric(batch, encoding, noise, losses)
         loss = losses["lambda_ic"] * loss_ic
         values = {"loss_ic": loss_ic, "psnr": psnr_of_mse(loss_ic.detach())}
+        # denoise the targets, conditioned on the renderings: L^DM
         if losses["lambda_dm"]:
             loss_dm = self._diffusion(batch, encoding, rendering, noise["eps"])
             loss = loss + losses["lambda_dm"] * loss_dm
@@ -103,9 +109,9 @@ class NerfDiffModule(LightningModule):
         return loss
 
     def validation_step(self, batch: ViewBatch, batch_idx: int) -> None:
-        encoding = self.model.encode(batch.source, batch.source_cameras, batch.near, batch.far)
+        encoding = self.model.encode(batch)
         rendering = self.model.render(encoding, batch.target_cameras)
-        rendered = rendering.rgb.movedim(-1, 2)
+        rendered = rendering.images
         self.log_dict(
             {
                 "val/psnr": psnr(rendered.flatten(0, 1), batch.targets.flatten(0, 1)).mean(),
@@ -115,7 +121,7 @@ class NerfDiffModule(LightningModule):
             sync_dist=True,
         )
         condition = self.model.condition(encoding, batch.target_cameras, rendered)
-        targets = 2 * batch.targets.flatten(0, 1) - 1
+        targets = to_signed(batch.targets.flatten(0, 1))
         eps = torch.randn(targets.shape, generator=generator("cpu", self.hparams.seed, "validation", batch_idx))
         losses = [
             self._denoising_loss(condition, targets, eps.to(targets), targets.new_full((len(targets),), t))
@@ -145,13 +151,13 @@ class NerfDiffModule(LightningModule):
     def configure_gradient_clipping(
         self, optimizer: Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
     ) -> None:
-        """By norm. Lightning's own refuses fused optimizers under autocast, which matters for fp16's scaler alone."""
+        """Clip by norm. Lightning's own refuses fused optimizers under autocast, because of fp16's scaler."""
         if gradient_clip_val:
             parameters = [p for group in optimizer.param_groups for p in group["params"]]
             clip_grad_norm_(parameters, gradient_clip_val, foreach=True)
 
     def on_train_start(self) -> None:
-        """A resumed run follows the settings it is given, where Lightning has just restored the old ones."""
+        """Apply the optimizer settings of this run, where Lightning has just restored the old ones."""
         (scheduler,) = (config.scheduler for config in self.trainer.lr_scheduler_configs)
         options = self.hparams.optimizer
         scheduler.base_lrs = [options["lr"] for _ in scheduler.base_lrs]
@@ -160,7 +166,7 @@ class NerfDiffModule(LightningModule):
             group["weight_decay"], group["betas"] = options["weight_decay"], tuple(options["betas"])
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """What a person has to keep the same to resume, or to use the model well."""
+        """Save settings that have to stay the same to resume, and those that describe the model."""
         checkpoint["accumulate_grad_batches"] = self.trainer.accumulate_grad_batches
         checkpoint["image_size"] = self.image_size
         checkpoint["trained_on"] = self.trained_on()
@@ -172,7 +178,7 @@ class NerfDiffModule(LightningModule):
 
     @property
     def kept(self) -> KeptRenderings | None:
-        """The frozen field's renderings, in a folder named by the weights that render them."""
+        """Kept renderings of the frozen field, in a folder named by the weights that render them."""
         if self._kept is None and self._kept_folder is not None:
             weights = hashlib.sha256()
             for part in (self.model.encoder, self.model.decoder):
@@ -182,7 +188,7 @@ class NerfDiffModule(LightningModule):
         return self._kept
 
     def trained_on(self) -> list[dict[str, Any]]:
-        """What the weights have seen: one entry for each training that led here, this one last."""
+        """Describe the training data of the weights: one entry for each training that led here, this one last."""
         data, losses = self.trainer.datamodule, self.hparams.losses
         part = "field" if losses["lambda_dm"] == 0 else "CDM" if losses["lambda_ic"] == 0 else "field and the CDM"
         seen = {
@@ -198,14 +204,14 @@ class NerfDiffModule(LightningModule):
     def _photometric(
         self, batch: ViewBatch, encoding: Encoding, noise: dict[str, Tensor], losses: Mapping
     ) -> tuple[Tensor, Float[Tensor, "batch targets 3 height width"] | None]:
-        """L^IC (paper, eq. "pixelnerf"), and the images that the CDM is to see (None: it is not trained)."""
+        """Compute L^IC (paper, eq. "pixelnerf"), and the renderings that condition the CDM (None: not trained)."""
         if self.frozen_field:
             with torch.no_grad():
                 rendered = self._rendered(batch, encoding)
             return F.mse_loss(rendered, batch.targets), rendered
         whole = losses["ray_share"] == 1
         if whole:
-            rendered = self.model.render(encoding, batch.target_cameras, noise["jitter"]).rgb.movedim(-1, 2)
+            rendered = self.model.render(encoding, batch.target_cameras, noise["jitter"]).images
             loss_ic = F.mse_loss(rendered, batch.targets)
         else:
             loss_ic = self._on_some_rays(batch, encoding, noise["rays"], noise["jitter"])
@@ -217,7 +223,7 @@ class NerfDiffModule(LightningModule):
             return loss_ic, self._rendered(batch, encoding)
 
     def _on_some_rays(self, batch: ViewBatch, encoding: Encoding, rays: Tensor, jitter: Tensor) -> Tensor:
-        """L^IC on rays [batch, n], numbered over all pixels of all targets of a draw."""
+        """Compute L^IC on rays [batch, n], numbered over all pixels of all targets of a draw."""
         bounds = encoding.features
         every = batch.target_cameras.rays(bounds.near[:, None], bounds.far[:, None])
         shape = every.directions.shape[:-1]
@@ -237,9 +243,9 @@ class NerfDiffModule(LightningModule):
         return F.mse_loss(rgb, torch.stack([one[index] for one, index in zip(colours, rays, strict=True)]))
 
     def _rendered(self, batch: ViewBatch, encoding: Encoding) -> Float[Tensor, "batch targets 3 height width"]:
-        """Whole targets without gradients or jitter; a frozen field's are kept."""
+        """Render whole targets without gradients or jitter; a frozen field's renderings are kept."""
         if self.kept is None:
-            return self.model.render(encoding, batch.target_cameras).rgb.movedim(-1, 2)
+            return self.model.render(encoding, batch.target_cameras).images
         images = []
         for draw, (scene, source, targets) in enumerate(
             zip(batch.scene_ids, batch.source_views, batch.target_views, strict=True)
@@ -250,16 +256,16 @@ class NerfDiffModule(LightningModule):
             own = replace(encoding, source=encoding.source[one], features=alone)
 
             def render(views: list[int], own: Encoding = own, one: slice = one) -> Tensor:
-                return self.model.render(own, batch.target_cameras[one, views]).rgb[0].movedim(-1, 1)
+                return self.model.render(own, batch.target_cameras[one, views]).images[0]
 
             names = [f"{scene}/{source}/{target}" for target in targets]
             images.append(self.kept.get(names, tuple(batch.targets.shape[-2:]), render))
         return torch.stack(images).to(batch.targets)
 
     def _diffusion(self, batch: ViewBatch, encoding: Encoding, rendered: Tensor, eps: Tensor) -> Tensor:
-        """L^DM (paper, eq. "ddpm") on v."""
+        """Compute L^DM (paper, eq. "ddpm") on v."""
         condition = self.model.condition(encoding, batch.target_cameras, rendered)
-        targets = 2 * batch.targets.flatten(0, 1) - 1
+        targets = to_signed(batch.targets.flatten(0, 1))
         views = batch.target_cameras.shape[1]
         each = (batch.draws[:, None] * views + torch.arange(views, device=batch.draws.device)).flatten()
         times = spread_times(each, self.hparams.seed)
@@ -277,7 +283,7 @@ class NerfDiffModule(LightningModule):
         return F.mse_loss(predicted, v_from_x0_eps(x0, eps, alpha, sigma))
 
     def _noise(self, batch: ViewBatch, losses: Mapping) -> dict[str, Tensor]:
-        """ε, the chosen rays and the ray jitter of every training item, each a function of its draw alone."""
+        """Draw ε, the chosen rays and the ray jitter of every training item, each a function of its draw alone."""
         targets = batch.targets
         samples = self.model.renderer.samples_per_ray
         rays = targets.shape[1] * targets.shape[-2] * targets.shape[-1]

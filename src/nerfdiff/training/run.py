@@ -3,7 +3,6 @@
 import logging
 import os
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -84,10 +83,10 @@ def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
         channels_last=channels_last(cfg.channels_last, trainer.strategy.root_device, cfg.compile != "none"),
         seed=cfg.seed,
         kept_renderings=_kept_renderings(cfg, datamodule),
+        renderer={"backend": cfg.backend, "kernel_precision": cfg.kernel_precision},
     )
     if last is None:
         _begin(module, cfg, model_config)
-    module.model.renderer = replace(module.model.renderer, backend=cfg.backend, kernel_precision=cfg.kernel_precision)
     compile_unets(module.model, cfg.compile, cfg.paths.compiled_dir)
     _announce(module, last, trainer.strategy.root_device)
     if trainer.is_global_zero and last is not None and last.name != LAST and (last.parent / LAST).exists():
@@ -130,7 +129,7 @@ def _begin(module: NerfDiffModule, cfg: DictConfig, model_config: dict) -> None:
 
 
 def _kept_renderings(cfg: DictConfig, data: SceneDataModule) -> str | None:
-    """The folder for a frozen field's renderings: its name says how which data are rendered."""
+    """Return the folder for a frozen field's renderings, named by the data and the renderer."""
     if not cfg.kept_renderings:
         return None
     if data.source_target_noise:
@@ -154,7 +153,7 @@ def _within_memory(model_config: dict, trainer: Trainer, data: SceneDataModule) 
 
 
 def build_trainer(cfg: DictConfig) -> Trainer:
-    """The Lightning Trainer of a composed training config."""
+    """Build the Lightning Trainer of a composed training config."""
     options: dict[str, Any] = {}
     if cfg.trainer.precision == "auto":
         options["precision"] = auto_precision(cfg.trainer.accelerator)
@@ -208,7 +207,7 @@ def _checkpoint_to_resume(output_dir: Path, cfg: DictConfig, model_config: dict,
 
 
 def _sound(output_dir: Path) -> str:
-    """What is left of a run that diverged."""
+    """Say which checkpoint of a run that diverged is sound."""
     last = last_checkpoint(output_dir)
     if not last.is_file():
         return "No checkpoint is from before that: start afresh"

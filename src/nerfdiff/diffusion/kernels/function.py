@@ -25,12 +25,12 @@ _PIXELS = 256
 
 
 class Settings(NamedTuple):
-    """What does not change from call to call.
+    """Settings of a norm that stay from call to call.
 
     Args:
         groups: of channels; a power of 2.
         eps: added to the variance.
-        active: whether SiLU follows.
+        active: true if SiLU follows.
     """
 
     groups: int
@@ -39,7 +39,7 @@ class Settings(NamedTuple):
 
 
 class FusedNorm(torch.autograd.Function):
-    """Keeps, beside the parameters, x and four numbers per image and channel."""
+    """Fused norm; keeps for the backward pass the parameters, x and four numbers per image and channel."""
 
     @staticmethod
     def forward(ctx, settings, dtype, recover, x, weight, bias, scale_shift):
@@ -88,7 +88,7 @@ def fused_norm(
 
 
 class _Sizes(NamedTuple):
-    """How the work of a [images, pixels, channels] is divided: `parts` times `steps` times `rows` pixels.
+    """Division of the work on [images, pixels, channels]: `parts` times `steps` times `rows` pixels.
 
     Args:
         padded: channels, up to a power of 2.
@@ -138,7 +138,7 @@ def _normalize(settings, dtype, x, weight, bias, scale_shift) -> tuple[Tensor, T
 
 
 def _gradients(settings, tensors, coefficients, gradient, needed) -> list[Tensor | None]:
-    """Of x, weight, bias and scale_shift, where needed."""
+    """Compute the gradients of x, weight, bias and scale_shift, where needed."""
     x, weight, bias, scale_shift = tensors
     images, pixels, channels, padded, rows, steps, parts = sizes = _sizes(x)
     gradient = gradient.contiguous(memory_format=torch.channels_last)

@@ -53,7 +53,7 @@ def coefficients_kernel(
     x, sums, weight, bias, scale_shift, coefficients, pixels, parts, eps,
     MODULATED: tl.constexpr, GROUPS: tl.constexpr, SIZE: tl.constexpr, SP: tl.constexpr,
 ):  # fmt: skip
-    """Of each channel: its group's mean and 1 / standard deviation, and a and b, so that norm, scale and shift together
+    """Compute for each channel its group's mean and 1 / standard deviation, and a and b: norm, scale and shift together
     are a (x − mean) + b.
 
     Args:

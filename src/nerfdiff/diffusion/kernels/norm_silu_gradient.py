@@ -55,7 +55,8 @@ def gradient_coefficients_kernel(
     MODULATED: tl.constexpr, AFFINE: tl.constexpr, MODULATION: tl.constexpr,
     GROUPS: tl.constexpr, SIZE: tl.constexpr, SP: tl.constexpr,
 ):  # fmt: skip
-    """What the group's mean and variance add to x's gradient, and the gradients of all that is one number per channel.
+    """Compute the terms of x's gradient through the group's mean and variance, and the gradients of weight, bias,
+    scale and shift.
 
     Args:
         scale_shift: [images, 2, C], where MODULATED.

@@ -22,7 +22,7 @@ from nerfdiff.utils.files import atomic
 log = logging.getLogger(__name__)
 
 UPSET = 3
-"""Steps in a row that a loss may jump by chance."""
+"""Steps in a row in which a loss may jump by chance."""
 
 
 class SoundCheckpoint(ModelCheckpoint):
@@ -174,13 +174,13 @@ def _between_steps(trainer: Trainer) -> bool:
 
 
 def _guard(trainer: Trainer) -> NonFiniteGuard:
-    """The callback that knows how steps go; without it all are taken to be good."""
+    """Return the callback that watches for failed steps; without it all count as good."""
     guards = [callback for callback in trainer.callbacks if isinstance(callback, NonFiniteGuard)]
     return guards[0] if guards else NonFiniteGuard(patience=1, spike=1.0, memory=1)
 
 
 def _most(trainer: Trainer, number: int) -> int:
-    """The largest of all processes' numbers, so that they do the same."""
+    """Return the largest of all processes' numbers, so that they do the same."""
     if trainer.world_size == 1:
         return number
     mine = torch.tensor(number, device=trainer.strategy.root_device)

@@ -30,11 +30,11 @@ class Dashboard(Callback):
         for writer in _writers(trainer):
             text = self.config.read_text(encoding="utf-8")
             settings = yaml.safe_load(text)
-            told = {key: _at(settings, key) for key in self.hparams}
+            values = {key: _at(settings, key) for key in self.hparams}
             if HydraConfig.initialized():
-                told |= tensorboard.overridden(HydraConfig.get().overrides.task, self.ignored)
-            texts = {"about": tensorboard.table(told), "config": tensorboard.code(text, "yaml")}
-            tensorboard.begin(writer, told, texts, self.layout)
+                values |= tensorboard.overridden(HydraConfig.get().overrides.task, self.ignored)
+            texts = {"about": tensorboard.table(values), "config": tensorboard.code(text, "yaml")}
+            tensorboard.begin(writer, values, texts, self.layout)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         for writer in _writers(trainer):
@@ -48,14 +48,14 @@ class Dashboard(Callback):
 
 
 def _writers(trainer: Trainer) -> list[SummaryWriter]:
-    """Where this process writes for TensorBoard, if it does."""
+    """Return this process's TensorBoard writers."""
     if not trainer.is_global_zero:
         return []
     return [logger.experiment for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
 
 
 def _at(settings: dict, key: str) -> object:
-    """A nested setting by its dotted key; None where there is none."""
+    """Return a nested setting by its dotted key; None where there is none."""
     for name in key.split("."):
         settings = settings.get(name) if isinstance(settings, dict) else None
     return settings

@@ -36,7 +36,7 @@ class NonFiniteGuard(Callback):
 
     @property
     def upset(self) -> int:
-        """Steps in a row, up to the last, that went wrong, see `Stability`."""
+        """Number of steps in a row, up to the last, that failed, see `Stability`."""
         return self.stability.upset
 
     def on_before_backward(self, trainer: Trainer, pl_module: LightningModule, loss: Tensor) -> None:

@@ -9,13 +9,13 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
 from nerfdiff.data.batch import ViewBatch
-from nerfdiff.distill.cdm import IndependentViews
+from nerfdiff.distill.cdm import CDMSampling
 from nerfdiff.model import NerfDiff
 from nerfdiff.results.pictures import colour_depth, contact_sheet
 
 
 class Previews(Callback):
-    """At each validation writes one sheet, a row per held-out view, as PNG and to TensorBoard.
+    """Write one sheet at each validation, a row per held-out view, as PNG and to TensorBoard.
 
     Args:
         folder: of the PNGs, named by step.
@@ -23,7 +23,7 @@ class Previews(Callback):
         sampler: how the CDM's views are sampled.
     """
 
-    def __init__(self, folder: str, scenes: int, sampler: IndependentViews):
+    def __init__(self, folder: str, scenes: int, sampler: CDMSampling):
         self.folder = Path(folder)
         self.scenes = scenes
         self.sampler = sampler
@@ -51,12 +51,12 @@ class Previews(Callback):
     def _pictures(
         self, model: NerfDiff, batch: ViewBatch, seed: int
     ) -> dict[str, Float[Tensor, "views 3 height width"]]:
-        encoding = model.encode(batch.source, batch.source_cameras, batch.near, batch.far)
+        encoding = model.encode(batch)
         rendering = model.render(encoding, batch.target_cameras)
         near, far = float(batch.near[0]), float(batch.far[0])
         pictures = {
             "input": batch.source.expand_as(batch.targets[0]),
-            "render": rendering.rgb[0].movedim(-1, 1),
+            "render": rendering.images[0],
             "depth": colour_depth(rendering.depth[0], near, far, rendering.opacity[0]),
             "cdm": self.sampler.sample(model, encoding, batch.target_cameras, (seed, "preview", *batch.scene_ids))[0],
             "truth": batch.targets[0],

@@ -1,4 +1,4 @@
-"""How far a training is: a bar on a terminal, elsewhere a line now and then."""
+"""Progress of a training: a bar on a terminal, elsewhere a line now and then."""
 
 import logging
 import sys
@@ -26,7 +26,7 @@ class TrainingProgress(ProgressBar):
         self._bar: Progress | None = None
 
     def disable(self) -> None:
-        """Lightning's wish for all processes but the first: they say nothing in any case."""
+        """Do nothing: Lightning calls this in all processes but the first, which print nothing in any case."""
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._first = self._said = trainer.global_step
@@ -74,17 +74,17 @@ def _words(trainer: Trainer) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A time as a person says it."""
+    """Return a time in words."""
     hours, minutes = divmod(round(seconds / 60), 60)
     return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min" if minutes else f"{seconds:.0f} s"
 
 
 def timer_of(trainer: Trainer) -> Timer | None:
-    """What ends the training at `trainer.max_time`; None without such a limit."""
+    """Return the timer of `trainer.max_time`; None without such a limit."""
     return next((callback for callback in trainer.callbacks if isinstance(callback, Timer)), None)
 
 
 def share_of_time(timer: Timer) -> float:
-    """Share of the limit that has passed, over all sessions of the run."""
+    """Return the share of the limit that has passed, over all sessions of the run."""
     passed = timer.time_elapsed()
     return passed / (passed + timer.time_remaining())

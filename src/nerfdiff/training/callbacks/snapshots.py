@@ -27,7 +27,8 @@ class Snapshots(Callback):
     Args:
         folder: of the files.
         every_n_steps: optimizer steps from one snapshot to the next; the last step is always one.
-        lengths: relative standard deviations σ_rel of the averages, shares of the training so far (EDM2: 0.05, 0.1).
+        lengths: relative standard deviations σ_rel of the averages, shares of the training so far (EDM2: 0.05, 0.1;
+            arXiv 2312.02696).
 
     Raises:
         ConfigError: a length that no average has.

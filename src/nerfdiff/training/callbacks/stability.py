@@ -1,10 +1,10 @@
-"""How calmly a run trains, in memory that does not grow with its steps."""
+"""Statistics of a training's stability, in memory that does not grow with its steps."""
 
 import math
 from typing import Any
 
 _BINS = 32
-"""Per factor of two: norms that fall into one bin differ by 2 % at most."""
+"""Bins per factor of two: norms of one bin differ by 2 % at most."""
 
 
 class Stability:
@@ -24,7 +24,7 @@ class Stability:
         self._norms: dict[int, int] = {}
 
     def add(self, norm: float, loss: float) -> None:
-        """One optimizer step's gradient norm, before clipping, and its loss."""
+        """Add one optimizer step's gradient norm, before clipping, and its loss."""
         far = self.steps > 0 and 0 < self.spike * self._mean < loss
         self.upset = 0 if math.isfinite(norm) and math.isfinite(loss) and not far else self.upset + 1
         if not math.isfinite(norm):
@@ -42,7 +42,7 @@ class Stability:
         self._mean = loss if self.steps == 1 else (1 - share) * self._mean + share * loss
 
     def quantile(self, share: float) -> float | None:
-        """The norm that this share of the positive, finite ones does not exceed, to 1 %; None if there were none."""
+        """Return the norm that this share of the positive, finite ones does not exceed, to 1 %; None without any."""
         left = share * sum(self._norms.values())
         for number in sorted(self._norms):
             left -= self._norms[number]
@@ -51,7 +51,7 @@ class Stability:
         return None
 
     def summary(self) -> dict[str, float | int | None]:
-        """Under the names of `ResultRow`."""
+        """Return the numbers under the names of `ResultRow`."""
         return {
             "nonfinite_grad_steps": self.nonfinite,
             "loss_spikes": self.spikes,

@@ -1,4 +1,4 @@
-"""How fast training goes."""
+"""Images per second of a training."""
 
 import time
 

@@ -1,4 +1,4 @@
-"""What is evaluated on what: a model, scenes, and all that predictions of one run share."""
+"""An evaluation run: a model, scenes, settings, and all that predictions of one run share."""
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -25,25 +25,84 @@ from nerfdiff.utils.hashes import sha256_file, sha256_values
 log = logging.getLogger(__name__)
 
 PRECISIONS = ("32-true", "bf16-mixed")
+SAMPLES = ("uniform_samples", "importance_samples")
 
 
 @dataclass(frozen=True)
-class Subject:
+class Orbit:
+    """Settings of the videos of a circle around the object; `scenes` are shown side by side in evaluate.py's."""
+
+    frames: int
+    fps: int
+    scenes: int = 1
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """Settings of the contact sheet."""
+
+    scenes: int
+    views: int
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Settings that evaluate.py and distill.py share (`conf/common/evaluation.yaml` says more of each).
+
+    Args:
+        dataset: name and split.
+        results: file to which a row per strategy is appended.
+        scoring: settings of the metrics, as plain data.
+        compiled: whether the U-Nets are.
+        minutes: after which no scene begins.
+        progress_every: seconds between lines where there is no terminal.
+        per_scene: leave every scene's field, trace and orbit beside its views.
+    """
+
+    run_name: str
+    dataset: str
+    seed: int
+    results: Path
+    scoring: Mapping[str, Any]
+    compiled: bool
+    scenes_at_once: int
+    minutes: float | None
+    progress_every: float | None
+    per_scene: bool
+    orbit: Orbit
+    sheet: Sheet
+
+    @staticmethod
+    def of(cfg: DictConfig) -> "RunSettings":
+        """Read the settings of a composed config."""
+        same = ("run_name", "seed", "scenes_at_once", "minutes", "progress_every", "per_scene")
+        return RunSettings(
+            **{name: cfg[name] for name in same},
+            dataset=f"{cfg.data.name}/{cfg.data.test_split}",
+            results=Path(cfg.results),
+            scoring=plain(cfg.metrics),
+            compiled=cfg.compile != "none",
+            orbit=instantiate(cfg.orbit),
+            sheet=instantiate(cfg.sheet),
+        )
+
+
+@dataclass(frozen=True)
+class EvaluationRun:
     """A model and scenes, on a device.
 
     Args:
-        cfg: of evaluate.py or distill.py.
-        load: batches of one scene each, of these ids.
-        identity: what makes predictions comparable; other settings of it, other predictions.
-        folder: of all that the run leaves.
+        load: reads the scenes of these ids, in batches of one.
+        identity: all settings that predictions depend on.
+        folder: holds all files of the run.
         stability: of the model's training, see `LoadedModel`.
-        conditions: a digest of what changes what scenes cost, and their numbers by rounding at most: hardware, threads,
-            scenes at once, the renderer's chunks and the memory layout.
+        cost_key: a digest of settings that change the costs of scenes, and their numbers by rounding at most: hardware,
+            threads, scenes at once, the renderer's chunks and the memory layout.
         rows_before: bytes of the file of results before this run.
         data: where the scenes come from; None for a picture, whose other views nobody knows.
     """
 
-    cfg: DictConfig
+    settings: RunSettings
     model: NerfDiff
     load: Callable[[Sequence[str]], Iterable[ViewBatch]]
     scene_ids: list[str]
@@ -52,7 +111,7 @@ class Subject:
     identity: dict[str, Any]
     folder: Path
     stability: Mapping[str, float | int | None]
-    conditions: str
+    cost_key: str
     rows_before: int
     data: SceneDataModule | None
 
@@ -61,7 +120,7 @@ class Subject:
         return self.folder / "predictions"
 
     def autocast(self) -> AbstractContextManager:
-        """bf16 products where the precision asks for them."""
+        """Compute products in bf16 where the precision asks for it."""
         if self.precision == "32-true":
             return nullcontext()
         # Without the cache: it would keep the first bf16 copy of parameters that a strategy fits.
@@ -69,7 +128,7 @@ class Subject:
 
 
 def choose_device(name: str) -> torch.device:
-    """A device by its name, or by what there is.
+    """Return a device by its name; `auto` is the first GPU, or the CPU where there is none.
 
     Raises:
         ConfigError: it cannot be used here.
@@ -86,14 +145,25 @@ def choose_device(name: str) -> torch.device:
     return device
 
 
-def dataset_subject(cfg: DictConfig, device: torch.device) -> Subject:
-    """The test scenes of `cfg.data`.
+def _load(cfg: DictConfig) -> LoadedModel:
+    """Load the model with the renderer's settings of this run; null leaves those of the training."""
+    for name in SAMPLES:
+        if cfg[name] is not None and cfg[name] < 1:
+            raise ConfigError(f"{name}={cfg[name]} must be at least 1, or null for what the model was trained with")
+    renderer = {name: cfg[name] for name in ("backend", "kernel_precision", "chunk", *SAMPLES)}
+    renderer = {name: value for name, value in renderer.items() if value is not None}
+    loaded = load_model(cfg.ckpt, cfg.weights, cfg.paths.assets_dir, renderer)
+    log.info("ckpt=%s", loaded.describe())
+    return loaded
+
+
+def dataset_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
+    """Prepare the test scenes of `cfg.data`.
 
     Raises:
         UserError: bad data, config or checkpoint.
     """
-    loaded = load_model(cfg.ckpt, cfg.weights, cfg.paths.assets_dir)
-    log.info("ckpt=%s", loaded.describe())
+    loaded = _load(cfg)
     datamodule = instantiate(cfg.data)
     datamodule.setup("test")
     reader = datamodule.reader("test")
@@ -116,19 +186,18 @@ def dataset_subject(cfg: DictConfig, device: torch.device) -> Subject:
         "reader": reader.identity,
         "views": [cfg.data.source_view, cfg.data.eval_stride],
         "image_size": size,
-        "mean_image_scenes": cfg.get("mean_image_scenes"),  # of a baseline that only evaluate.py has
+        "mean_image_scenes": cfg.get("mean_image_scenes"),  # a baseline of evaluate.py
     }
-    return _subject(cfg, device, loaded, load, scene_ids, facts, datamodule)
+    return _run(cfg, device, loaded, load, scene_ids, facts, datamodule)
 
 
-def picture_subject(cfg: DictConfig, device: torch.device) -> Subject:
-    """The scene on the picture `cfg.image`, to be seen from `cfg.picture_views`.
+def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
+    """Prepare the scene of the picture `cfg.image`, to be rendered from `cfg.picture_views`.
 
     Raises:
         UserError: bad picture, config or checkpoint.
     """
-    loaded = load_model(cfg.ckpt, cfg.weights, cfg.paths.assets_dir)
-    log.info("ckpt=%s", loaded.describe())
+    loaded = _load(cfg)
     size = loaded.image_size or plain(cfg.picture_size)
     if size is None:
         raise ConfigError(f"{loaded.path} does not say what image size it is for: give picture_size=[height,width]")
@@ -145,10 +214,10 @@ def picture_subject(cfg: DictConfig, device: torch.device) -> Subject:
         "picture_views": plain(cfg.picture_views),
         "image_size": list(size),
     }
-    return _subject(cfg, device, loaded, lambda names: [scene] * len(names), list(scene.scene_ids), facts, None)
+    return _run(cfg, device, loaded, lambda names: [scene] * len(names), list(scene.scene_ids), facts, None)
 
 
-def _subject(
+def _run(
     cfg: DictConfig,
     device: torch.device,
     loaded: LoadedModel,
@@ -156,17 +225,10 @@ def _subject(
     scene_ids: list[str],
     facts: dict[str, Any],
     data: SceneDataModule | None,
-) -> Subject:
+) -> EvaluationRun:
     precision = cfg.precision if cfg.precision != "auto" else auto_precision(device.type)
     if precision not in PRECISIONS:
         raise ConfigError(f"precision must be auto, {' or '.join(PRECISIONS)}, got {precision!r}")
-    samples = {
-        name: getattr(loaded.model.renderer, name) if cfg[name] is None else cfg[name]
-        for name in ("uniform_samples", "importance_samples")
-    }
-    for name, number in samples.items():
-        if number < 1:
-            raise ConfigError(f"{name}={number} must be at least 1, or null for what the model was trained with")
     identity = facts | {
         "ckpt_sha256": sha256_file(loaded.path),
         "weights": loaded.weights,
@@ -175,29 +237,21 @@ def _subject(
         "kernel_precision": cfg.kernel_precision,
         "backend": cfg.backend,
         "compile": cfg.compile,
-        "samples": samples,
+        "samples": {name: getattr(loaded.model.renderer, name) for name in SAMPLES},
         "device": device.type,  # whose generators draw the noise
         "orbit": cfg.per_scene and cfg.orbit.frames,
         "strategy": plain(cfg.strategy),
     }
     folder = Path(cfg.paths.output_dir) / f"{cfg.strategy.name}-{sha256_values(identity)[:8]}"
     model = loaded.model.to(device).requires_grad_(False)
-    model.renderer = replace(
-        model.renderer,
-        backend=cfg.backend,
-        kernel_precision=cfg.kernel_precision,
-        chunk=cfg.chunk or model.renderer.chunk,
-        **samples,
-    )
     in_pixels = channels_last(cfg.channels_last, device, cfg.compile != "none")
     if in_pixels:
         model.to(memory_format=torch.channels_last)
     compile_unets(model, cfg.compile, cfg.paths.compiled_dir)
     spent_on = [hardware(device), cfg.threads, cfg.scenes_at_once, model.renderer.chunk, in_pixels]
-    conditions = sha256_values(spent_on)[:8]
-    results = Path(cfg.results)
-    return Subject(
-        cfg=cfg,
+    settings = RunSettings.of(cfg)
+    return EvaluationRun(
+        settings=settings,
         model=model,
         load=load,
         scene_ids=scene_ids,
@@ -206,7 +260,7 @@ def _subject(
         identity=identity,
         folder=folder,
         stability=loaded.stability,
-        conditions=conditions,
-        rows_before=results.stat().st_size if results.is_file() else 0,
+        cost_key=sha256_values(spent_on)[:8],
+        rows_before=settings.results.stat().st_size if settings.results.is_file() else 0,
         data=data,
     )

@@ -1,0 +1,58 @@
+"""Settings of the fit of a field to images of a scene at test time."""
+
+import math
+from dataclasses import dataclass
+
+from nerfdiff.utils.errors import ConfigError
+
+DECAYS = {
+    "none": lambda done: 1.0,
+    "linear": lambda done: 1 - done,
+    "cosine": lambda done: 0.5 * (1 + math.cos(math.pi * done)),
+}
+"""Factors of the learning rates, by the share of the teacher's steps that are done."""
+
+COARSE = ("every_step", "refresh")
+"""Choices of when coarse weights are computed."""
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """Settings of the inner steps (paper, appendix, "Finetuning phase"); `conf/common/distillation.yaml` has them.
+
+    Args:
+        inner_steps: N, Adam steps after each of the teacher's.
+        rays: B, per inner step and scene.
+        lr_planes, lr_decoder: learning rates of W and θ.
+        lr_decay: of both, over the teacher's steps: `none`, `linear` or `cosine`.
+        fit_source: whether the input image, the one view that is known, is fitted beside the virtual views.
+        target_tolerance, source_tolerance: dB by which the last targets and the input view may be explained worse
+            before a scene falls back to its first field.
+        coarse: when the weights are computed from which importance samples are drawn: at `every_step` of the inner
+            ones, or at each `refresh`, when the field is rendered for the teacher anyway: inner steps then evaluate all
+            their samples at once. Kept weights take 2 bytes for each bin of each ray of all views. Where teachers do
+            not follow the field, nothing is rendered between inner steps, and weights are computed at every step.
+        cuda_graphs: record an inner step once and replay it, on a GPU.
+
+    Raises:
+        ConfigError: another `lr_decay` or `coarse`, no rays, or negative steps.
+    """
+
+    inner_steps: int
+    rays: int
+    lr_planes: float
+    lr_decoder: float
+    lr_decay: str
+    fit_source: bool
+    target_tolerance: float
+    source_tolerance: float
+    coarse: str
+    cuda_graphs: bool
+
+    def __post_init__(self):
+        if self.rays < 1 or self.inner_steps < 0:
+            raise ConfigError(f"rays={self.rays} must be at least 1 and inner_steps={self.inner_steps} at least 0")
+        if self.lr_decay not in DECAYS:
+            raise ConfigError(f"strategy.lr_decay={self.lr_decay!r}: choose {', '.join(DECAYS)}")
+        if self.coarse not in COARSE:
+            raise ConfigError(f"strategy.coarse={self.coarse!r}: choose {', '.join(COARSE)}")

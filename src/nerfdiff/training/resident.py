@@ -37,6 +37,7 @@ from nerfdiff.results.environment import git_state
 from nerfdiff.training.run import plain
 from nerfdiff.utils.errors import ConfigError, DataError, TrainingDiverged
 from nerfdiff.utils.files import atomic
+from nerfdiff.utils.images import to_signed
 from nerfdiff.utils.randomness import seed_of, spread_times
 
 log = logging.getLogger(__name__)
@@ -130,8 +131,8 @@ class FrozenField:
         for scene, source in (part.unbind(1) for part in pairs.split(batch)):
             own, all_views = scenes.cameras(scene, source, everything.expand(len(scene), -1))
             with autocast:
-                encoding = model.encode(scenes.images(scene, source), own, scenes.near[scene], scenes.far[scene])
-                rendered.append(model.render(encoding, all_views).rgb.movedim(-1, 2).half())
+                encoding = model.encode_images(scenes.images(scene, source), own, scenes.near[scene], scenes.far[scene])
+                rendered.append(model.render(encoding, all_views).images.half())
             context.append(encoding.context)
         shape = (count, min(sources, views))
         self.rendered = torch.cat(rendered).unflatten(0, shape)
@@ -224,10 +225,10 @@ class Step:
         own, relative = scenes.cameras(scene, source, targets)
         losses = {}
         if self.frozen is None:
-            encoding = model.encode(scenes.images(scene, source), own, scenes.near[scene], scenes.far[scene])
+            encoding = model.encode_images(scenes.images(scene, source), own, scenes.near[scene], scenes.far[scene])
             rays = math.prod(targets.shape[1:]) * math.prod(truth.shape[-2:])
             jitter = torch.rand(len(rows), rays, model.renderer.samples_per_ray, device=truth.device)
-            rendered = model.render(encoding, relative, jitter).rgb.movedim(-1, 2)
+            rendered = model.render(encoding, relative, jitter).images
             losses["loss_ic"] = F.mse_loss(rendered, truth)
             condition = model.condition(encoding, relative, rendered)
         else:
@@ -239,7 +240,7 @@ class Step:
                 near=scenes.near[scene].repeat_interleave(every),
                 context=[level[scene, source] for level in self.frozen.context],
             )
-        x0 = 2 * truth.flatten(0, 1) - 1
+        x0 = to_signed(truth.flatten(0, 1))
         eps = torch.randn_like(x0)
         t = spread_times(self.number * len(x0) + torch.arange(len(x0), device=x0.device), self.seed)
         alpha, sigma = (expand(c, x0) for c in alpha_sigma(t))
@@ -342,14 +343,15 @@ def _model(cfg: DictConfig, begun: LoadedModel) -> NerfDiff:
     if cfg.part not in ("cdm", "joint"):
         raise ConfigError(f"part={cfg.part}: choose cdm (the field stays as it is) or joint")
     torch.manual_seed(cfg.seed)
-    model = NerfDiff(**(dict(begun.config) | {"conditioning": plain(cfg.conditioning)}))
+    sizes = dict(begun.config)
+    render = {**sizes["render"], "backend": cfg.backend}
+    model = NerfDiff(**sizes | {"render": render, "conditioning": plain(cfg.conditioning)})
     kept = begun.model.state_dict()
     if cfg.fresh_cdm:
         kept = {name: value for name, value in kept.items() if not name.startswith("denoiser.")}
     missing = model.load_state_dict(kept, strict=False).missing_keys
     if any(not name.startswith("denoiser.") for name in missing) or (missing and not cfg.fresh_cdm):
         raise ConfigError(f"init={cfg.init} lacks {missing[0]}; set fresh_cdm=true to begin with a new CDM")
-    model.renderer = replace(model.renderer, backend=cfg.backend)
     if cfg.channels_last:
         model.to(memory_format=torch.channels_last)
     return model

@@ -116,7 +116,8 @@ def _command(hydra: DictConfig) -> str:
     words = command_words(hydra.job.config_name)
     if any(word.startswith("sweep=") for word in hydra.overrides.task):
         words.append("hydra.mode=RUN")  # the settings of a sweep's jobs, and not the sweep again
-    return shlex.join([*words, *hydra.overrides.task])
+    own = [f"{source.schema}://{source.path}" for source in hydra.runtime.config_sources if "line" in source.provider]
+    return shlex.join([*words, *([f"hydra.searchpath=[{','.join(own)}]"] if own else []), *hydra.overrides.task])
 
 
 def _environment(cfg: DictConfig) -> dict[str, Any]:

@@ -54,7 +54,7 @@ class WholeScene:
         field: Path,
         device: torch.device,
     ) -> dict[str, float | None]:
-        """The metrics of `summary.SCENE_METRICS`; None or missing where they cannot be measured.
+        """The metrics of whole scenes in `table.METRICS`; None or missing where they cannot be measured.
 
         Args:
             number: of the scene among those predicted.

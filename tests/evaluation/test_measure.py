@@ -23,7 +23,7 @@ def test_the_command_says_to_a_shell_what_the_job_was_told(words, more, own):
     ]
     sources = [dict(zip(("schema", "path", "provider"), source, strict=True)) for source in sources]
     job = {"job": {"config_name": "distill"}, "overrides": {"task": words}, "runtime": {"config_sources": sources}}
-    hydra, more = OmegaConf.create(job), [*more, *([f"hydra.searchpath={[f'file://{own}']}"] if own else [])]
+    hydra, more = OmegaConf.create(job), [*more, *([f'hydra.searchpath=["file://{own}"]'] if own else [])]
     said = shlex.split(_command(hydra))
     assert said == ["python", "src/distill.py", *more, *words]
     check_overrides("distill", said[2:])

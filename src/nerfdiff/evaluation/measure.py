@@ -118,7 +118,7 @@ def _command(hydra: DictConfig) -> str:
         words.append("hydra.mode=RUN")  # the settings of a sweep's jobs, and not the sweep again
     given = [source for source in hydra.runtime.config_sources if "command-line" in source.provider]
     if folders := [f"{source.schema}://{source.path}" for source in given]:  # of configs: --config-dir and the like
-        words.append(f"{SEARCHPATH}={folders}")
+        words.append(f"{SEARCHPATH}={json.dumps(folders)}")
     return shlex.join([*words, *hydra.overrides.task])
 
 

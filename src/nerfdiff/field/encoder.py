@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -15,6 +16,14 @@ from nerfdiff.field.vision_features import VisionFeatures
 from nerfdiff.utils.errors import ConfigError
 
 
+@runtime_checkable
+class Features(Protocol):
+    """W, of whatever kind: what a field is made of, and the bounds of each scene."""
+
+    near: Float[Tensor, "batch"]
+    far: Float[Tensor, "batch"]
+
+
 @dataclass(frozen=True)
 class Encoding:
     """What is known of a scene after one look: computed once per input image, whatever follows.
@@ -26,7 +35,7 @@ class Encoding:
     """
 
     source: Float[Tensor, "batch 3 height width"]
-    features: Triplane | PixelFeatures
+    features: Features
     context: Context
 
     @property

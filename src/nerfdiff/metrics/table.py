@@ -107,6 +107,8 @@ METRICS = _table(
 """By name, in the order in which all show them. `register` adds those that come with a config or with a row."""
 PACKAGE = tuple(METRICS.values())
 """Those that a result row has fields for."""
+TAKEN = set(METRICS)
+"""Names that no other metric can have: `results.row` adds those of a row's other fields."""
 
 
 def register(metric: Metric) -> None:
@@ -121,12 +123,12 @@ def own(settings: Mapping[str, Mapping[str, Any]]) -> list[Metric]:
         settings: by name, the other arguments of `Metric`.
 
     Raises:
-        ConfigError: settings that do not make a metric, or the name of one of this package.
+        ConfigError: settings that do not make a metric, or a name that is taken.
     """
     made = []
     for name, values in settings.items():
-        if any(name == metric.name for metric in PACKAGE):
-            raise ConfigError(f"metrics.own.{name}: there is a metric of this name already; choose another")
+        if name in TAKEN:
+            raise ConfigError(f"metrics.own.{name}: results have a field of this name already; choose another")
         try:
             made.append(Metric(name, **values))
         except TypeError as error:

@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any, get_args
 
-from nerfdiff.metrics.table import PACKAGE, Metric, register
+from nerfdiff.metrics.table import PACKAGE, TAKEN, Metric, register
 from nerfdiff.utils.errors import ConfigError, DataError, some
 from nerfdiff.utils.files import NONFINITE, encode
 
@@ -389,7 +389,7 @@ def _own_metrics(value: Any) -> OwnMetrics | None:
         return None
     found = {}
     for name, described in value.items():
-        if type(described) is not dict or name in KINDS or "name" in described or "measure" in described:
+        if type(described) is not dict or name in TAKEN or "name" in described or "measure" in described:
             return None
         number = described.get("value")
         decoded = None if number is None else _float(number)
@@ -427,6 +427,7 @@ KINDS = {
 
 
 TIMINGS = {f.name: tuple(f"{f.name}_{part}" for part in PARTS) for f in fields(ResultRow) if f.type == Timing | None}
+TAKEN.update(KINDS)
 COLUMNS = tuple(c for f in fields(ResultRow) if f.name != "own_metrics" for c in TIMINGS.get(f.name, (f.name,)))
 
 

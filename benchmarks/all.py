@@ -18,6 +18,7 @@ from pathlib import Path
 import torch
 
 from harness import RESULTS
+from nerfdiff.cli import choices
 from nerfdiff.evaluation.run import choose_device
 
 SHARES = {"render": 1.0, "inner_step": 1.0, "unet": 2.0, "training_step": 3.0, "ngd_object": 3.0, "field_speed": 2.0}
@@ -90,9 +91,7 @@ def _arguments(words):
     made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("--minutes", type=float, default=10.0, help="for all together, at most")
     made.add_argument("--seconds", type=float, default=3.0, help="for each variant at each setting, about")
-    made.add_argument(
-        "--model", choices=("tiny", "small", "base", "large"), default="base" if cuda else "tiny", help="random weights"
-    )
+    made.add_argument("--model", choices=choices("model"), default="base" if cuda else "tiny", help="random weights")
     made.add_argument("--ckpt", help="a trained model instead")
     made.add_argument("--size", type=int, help="image side in pixels; default: the model's own")
     made.add_argument("--device", default="auto")

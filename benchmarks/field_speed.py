@@ -19,14 +19,15 @@ import torch
 import costs
 from harness import Row, Variant, Work, interleaved, parser
 from nerfdiff.cameras import Rays
+from nerfdiff.cli import choices
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.field.encoder import Encoding
-from nerfdiff.field.kinds import PIXELNERF, TRIPLANE, VISIONNERF
+from nerfdiff.field.kinds import TRIPLANE
 from nerfdiff.render.renderer import Renderer
 from report import Report
 from subjects import Subject, scene, subject
 
-NAMES = {PIXELNERF: "pixelNeRF", VISIONNERF: "VisionNeRF"}
+NAMES = {"pixelnerf": "pixelNeRF", "visionnerf": "VisionNeRF"}
 TRIPLANES = {"base": "NerfDiff-B", "large": "NerfDiff-L"}
 PAPER = {
     "pixelNeRF": (0.007, 1.639),
@@ -58,7 +59,8 @@ def main(words: list[str] | None = None) -> str:
 def _subjects(arguments: argparse.Namespace) -> dict[str, Subject]:
     """By name, the triplane models first; of their diffusion models nothing but the sizes is kept."""
     wanted = {TRIPLANES.get(model, f"triplane, {model}"): (model, TRIPLANE) for model in arguments.models}
-    wanted |= {name: (arguments.models[0], field) for field, name in NAMES.items()}
+    others = [field for field in choices("field") if field != TRIPLANE]
+    wanted |= {NAMES.get(field, field): (arguments.models[0], field) for field in others}
     made = {}
     for name, (model, field) in wanted.items():
         overrides = [f"field={field}", *arguments.overrides]
@@ -170,8 +172,9 @@ def _beside(name: str, column: int) -> dict[str, float]:
 def _arguments(words):
     made = parser(__doc__)
     made.set_defaults(model="base")
-    sizes = ("tiny", "small", "base", "large")
-    made.add_argument("--models", nargs="+", choices=sizes, default=["base", "large"], help="of the triplanes")
+    made.add_argument(
+        "--models", nargs="+", choices=choices("model"), default=["base", "large"], help="of the triplanes"
+    )
     made.add_argument("--rays", type=int, help="of the view, rendered at a time; default: all")
     arguments = made.parse_args(words)
     if arguments.ckpt is not None or arguments.model != "base":

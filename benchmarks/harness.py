@@ -18,6 +18,7 @@ from typing import Any
 
 import torch
 
+from nerfdiff.cli import choices
 from nerfdiff.utils.timing import Stopwatch, summarise
 
 RESULTS = Path(os.environ.get("OUT") or Path(__file__).parent / "results")
@@ -111,7 +112,7 @@ class Limits:
 def parser(description: str, model: str = "tiny", sweeps: Sequence[str] = ()) -> argparse.ArgumentParser:
     """The options that benchmarks share."""
     made = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    made.add_argument("--model", choices=("tiny", "small", "base", "large"), default=model, help="with random weights")
+    made.add_argument("--model", choices=choices("model"), default=model, help="with random weights")
     made.add_argument("--ckpt", help="a trained model instead, as for evaluate.py: demo, a run's folder, a file")
     made.add_argument("--size", type=int, help="image side in pixels; default: the model's own")
     made.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, …")

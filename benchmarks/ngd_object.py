@@ -23,7 +23,7 @@ from hydra.utils import instantiate
 import costs
 from harness import Row, Unavailable, Work, interleaved, parser, settings_of
 from inner_step import steps_of
-from nerfdiff.cli import load_config
+from nerfdiff.cli import choices, load_config
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.distillation import Distillation
 from nerfdiff.distill.virtual_views import VirtualViews
@@ -37,7 +37,6 @@ from subjects import Subject, scene, subject
 from variants import models, renderers
 
 SWEEPS = {"views": (5, 10, 25, 50, 100), "scenes": (1, 2, 4, 8)}
-STRATEGIES = ("ngd", "ngd_current", "direct", "sds", "stochastic")
 REFERENCE, FAST = "reference", "fast"
 FIT = "N inner steps"
 CHANGED = ("render K views", FIT)
@@ -62,10 +61,14 @@ class Plan:
         """With these overrides of the distillation's config.
 
         Raises:
-            ConfigError: an override names no key.
+            ConfigError: an override names no key, or the strategy fits no field.
         """
         words = ["ckpt=none", "data=srn_cars", f"strategy={arguments.strategy}", f"budget={arguments.budget}", *changes]
         cfg = load_config("distill", words + ([] if views is None else [f"budget.views={views}"]))
+        if "teacher" not in cfg.strategy:
+            raise ConfigError(
+                f"strategy={arguments.strategy} fits no field to an object: choose one that has a teacher"
+            )
         return Plan(plain(cfg.strategy), plain(cfg.budget), arguments.steps)
 
     @property
@@ -309,8 +312,8 @@ def _work(measured: Subject, budget: dict[str, int], setting: dict[str, int], st
 
 def _arguments(words):
     made = parser(__doc__, sweeps=tuple(SWEEPS))
-    made.add_argument("--strategy", choices=STRATEGIES, default="ngd_current")
-    made.add_argument("--budget", choices=("minutes", "paper"), default="minutes")
+    made.add_argument("--strategy", choices=choices("strategy"), default="ngd_current", help="one that fits a field")
+    made.add_argument("--budget", choices=choices("budget"), default="minutes")
     made.add_argument("--scenes", type=int, default=1, help="distilled in one batch")
     made.add_argument("--steps", type=int, help="diffusion steps to time; default: all of the budget")
     made.add_argument("--extrapolate", action="store_true", help="from --steps to all of the budget's, and say so")

@@ -17,8 +17,8 @@ from nerfdiff.cli import CONF, load_config
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.priors import Prior
 from nerfdiff.evaluation.run import choose_device
-from nerfdiff.model import NerfDiff
-from nerfdiff.utils.config import auto_precision, plain
+from nerfdiff.model import NerfDiff, settings_of
+from nerfdiff.utils.config import auto_precision
 
 SIZES = {"tiny": 32, "small": 64, "base": 128, "large": 128}
 """Pixels that the models are made for."""
@@ -74,7 +74,7 @@ def subject(arguments: argparse.Namespace) -> Subject:
         size = arguments.size or (loaded.image_size or [128])[0]
         return Subject(Path(arguments.ckpt).name, loaded.model.to(device), dict(loaded.config), size, device, precision)
     cfg = load_config("train", [f"model={arguments.model}", "data=srn_cars", *arguments.overrides])
-    config = plain(cfg.model) | {"conditioning": plain(cfg.conditioning)}
+    config = settings_of(cfg)
     torch.manual_seed(0)
     with device:
         model = NerfDiff(**config).eval()

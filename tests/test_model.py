@@ -3,14 +3,12 @@ import torch
 
 from model_fixtures import input_cameras, model
 from nerfdiff.cli import load_config
-from nerfdiff.data.batch import ViewBatch
-from nerfdiff.model import build_on_meta
-from nerfdiff.utils.config import plain
+from nerfdiff.model import build_on_meta, settings_of
 
 
 def counts(size: str) -> dict[str, int]:
     cfg = load_config("train", [f"model={size}"])
-    return build_on_meta(plain(cfg.model) | {"conditioning": plain(cfg.conditioning)}).parameter_count()
+    return build_on_meta(settings_of(cfg)).parameter_count()
 
 
 @pytest.mark.parametrize(("size", "encoder", "total"), [("base", 198e6, 438e6), ("large", 462e6, 1027e6)])
@@ -23,7 +21,7 @@ def test_the_papers_sizes(size, encoder, total):
 @pytest.mark.parametrize(("size", "expected"), [("base", 216_622_275), ("large", 507_325_955)])
 def test_without_cross_attention_the_cdm_is_adms_unet(size, expected):
     cfg = load_config("train", [f"model={size}", "conditioning.cross_attention=false"])
-    config = plain(cfg.model) | {"conditioning": plain(cfg.conditioning)}
+    config = settings_of(cfg)
     assert build_on_meta(config).parameter_count()["denoiser"] == expected
 
 

@@ -14,9 +14,8 @@ from nerfdiff.data.batch import ViewBatch
 from nerfdiff.field.field import PixelField
 from nerfdiff.field.pixel_features import PixelFeatures
 from nerfdiff.field.residual_mlp import ResidualMLP
-from nerfdiff.model import NerfDiff, build_on_meta
+from nerfdiff.model import NerfDiff, build_on_meta, settings_of
 from nerfdiff.training.memory import training_memory
-from nerfdiff.utils.config import plain
 from nerfdiff.utils.errors import ConfigError
 from pixel_fixtures import ENCODERS, pixel_config
 
@@ -63,7 +62,7 @@ def scene(number: int = 0) -> ViewBatch:
 
 def config(*overrides: str) -> dict:
     cfg = load_config("train", list(overrides))
-    return plain(cfg.model) | {"conditioning": plain(cfg.conditioning)}
+    return settings_of(cfg)
 
 
 @pytest.mark.parametrize("name", ENCODERS)
@@ -165,7 +164,7 @@ def test_what_fits_triplanes_says_what_it_needs_before_it_works(name, monkeypatc
 
 
 def test_a_name_or_an_attention_that_cannot_be_is_named():
-    with pytest.raises(ConfigError, match=r"model\.field\.name='nerf': choose triplane, pixelnerf, visionnerf"):
+    with pytest.raises(ConfigError, match=r"model\.field\.name='nerf': choose pixelnerf, triplane, visionnerf"):
         NerfDiff(**pixel_config("pixelnerf") | {"field": {"name": "nerf"}})
     attending = pixel_config("pixelnerf")
     attending["conditioning"]["cross_attention"] = True

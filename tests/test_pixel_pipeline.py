@@ -7,9 +7,9 @@ from nerfdiff.checkpoint import check_resumable, load_model
 from nerfdiff.cli import load_config
 from nerfdiff.evaluation.distill import distill
 from nerfdiff.evaluation.evaluate import evaluate
+from nerfdiff.model import settings_of
 from nerfdiff.results.row import read_rows
 from nerfdiff.training.run import train
-from nerfdiff.utils.config import plain
 from nerfdiff.utils.errors import CheckpointError, ConfigError
 from training_fixtures import evaluation_overrides, last_checkpoint, overrides, write_dataset
 
@@ -66,9 +66,9 @@ def test_distilling_it_ends_with_one_line_and_a_row(data, tmp_path):
 def test_a_run_of_another_field_is_not_gone_on_with(data, tmp_path):
     words = ["model=tiny", "data=srn_cars", "trainer=cpu"]
     other, same = (load_config("train", [*words, f"field={name}"]) for name in ("pixelnerf", "triplane"))
-    model = plain(same.model) | {"conditioning": plain(same.conditioning)}
+    model = settings_of(same)
     del model["field"]["name"]  # as of a run from before fields had names
     torch.save({"hyper_parameters": {"model": model}, "state_dict": {}, "global_step": 0}, tmp_path / "last.ckpt")
-    check_resumable(tmp_path / "last.ckpt", plain(same.model) | {"conditioning": plain(same.conditioning)}, 1)
+    check_resumable(tmp_path / "last.ckpt", settings_of(same), 1)
     with pytest.raises(CheckpointError, match=r"model\.field\.name: triplane → pixelnerf"):
-        check_resumable(tmp_path / "last.ckpt", plain(other.model) | {"conditioning": plain(other.conditioning)}, 1)
+        check_resumable(tmp_path / "last.ckpt", settings_of(other), 1)

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import pairwise
+from pathlib import Path
 
 import hydra
 from hydra import compose, initialize_config_dir
@@ -49,7 +50,9 @@ OPTIONAL_GROUPS = ("logger", "experiment", "sweep")
 MULTIRUN = ("-m", "--multirun")
 # Options with which a command shows something and runs nothing, or runs another config.
 SHOWING = ("-h", "--help", "--hydra-help", "--version", "-c", "--cfg", "-i", "--info")
-OTHER_CONFIG = ("-cp", "--config-path", "-cn", "--config-name", "-cd", "--config-dir", "--experimental-rerun")
+OTHER_CONFIG = ("-cp", "--config-path", "-cn", "--config-name", "--experimental-rerun")
+CONFIG_DIR = ("-cd", "--config-dir")
+SEARCHPATH = "hydra.searchpath"
 COMPLETING = ("-sc", "--shell-completion")
 EXCLUDED = "hydra.job.config.override_dirname.exclude_keys"
 MAX_FOLDER = 100
@@ -207,8 +210,11 @@ def prepare_arguments(config_name: str, inputs: Sequence[str], arguments: list[s
     overrides = _overrides(arguments)
     swept = {override.key_or_group for override in overrides if override.is_sweep_override()}
     fixed = {override.key_or_group: override for override in overrides if override.key_or_group not in swept}
-    words = [_choices(override)[0].input_line for override in overrides if _is_group(override)]
-    words += [override.input_line for override in fixed.values() if not _is_group(override)]
+    words = [
+        *_searchpath(arguments),
+        *(_choices(override)[0].input_line for override in overrides if _is_group(override)),
+    ]
+    words += [override.input_line for key, override in fixed.items() if not _is_group(override) and key != SEARCHPATH]
     config = _compose(config_name, words, with_hydra=True)
     if options.isdisjoint(MULTIRUN) and config.hydra.mode != RunMode.MULTIRUN:
         check_limits(config)
@@ -247,7 +253,7 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
     """
     choices = [_choices(override) for override in _overrides(arguments)]
     groups = [alternatives for alternatives in choices if _is_group(alternatives[0])]
-    configs = _compose_each(config_name, groups)
+    configs = _compose_each(config_name, groups, _searchpath(arguments))
     for override in (choice for alternatives in choices for choice in alternatives):
         if not (_is_group(override) or override.is_add() or override.is_force_add() or override.is_delete()):
             for config in configs:
@@ -262,14 +268,33 @@ def _choices(override: Override) -> list[Override]:
     return OverridesParser.create().parse_overrides(words) or [override]
 
 
-def _compose_each(config_name: str, groups: list[list[Override]]) -> list[DictConfig]:
+def _searchpath(arguments: list[str]) -> list[str]:
+    """The override, if any, with which Hydra also looks for configs where the arguments say.
+
+    Raises:
+        ConfigError: the folder of `--config-dir` is not there.
+    """
+    folders = []
+    for word, following in pairwise([*arguments, ""]):
+        option, given, value = word.partition("=")
+        if option in CONFIG_DIR:
+            folder = Path(value if given else following).absolute()
+            if not folder.is_dir():
+                raise ConfigError(f"{option} {folder}: no such folder; name a folder in the form of {CONF}")
+            folders.append(f"file://{folder}")
+        elif option == SEARCHPATH and (override := parse_override(word)):
+            folders += override.value()
+    return [f"{SEARCHPATH}={folders}"] if folders else []
+
+
+def _compose_each(config_name: str, groups: list[list[Override]], search: list[str]) -> list[DictConfig]:
     """A config for every choice of every group, the other groups being at their first choice."""
     groups = [choices for choices in groups if not choices[0].is_sweep_override()]
     for choice in (choice for choices in groups for choice in choices):
         _check_choice(choice)
-    first = [choices[0].input_line for choices in groups]
+    first = [*search, *(choices[0].input_line for choices in groups)]
     configs = [_composed(config_name, *first)]
-    for index, choices in enumerate(groups):
+    for index, choices in enumerate(groups, len(search)):
         for choice in choices[1:]:
             configs.append(_composed(config_name, *first[:index], choice.input_line, *first[index + 1 :]))
     return configs
@@ -303,11 +328,16 @@ def _is_group(override: Override) -> bool:
     return "/" in override.key_or_group or (CONF / override.key_or_group).is_dir()
 
 
+def choices(group: str) -> list[str]:
+    """The names that a config group has in conf/."""
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
 def _check_choice(override: Override) -> None:
     value, group = override.value(), override.key_or_group
     if isinstance(value, (str, list, dict)) or override.is_delete():
         return
-    names = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+    names = choices(group)
     without = f"; to go without, say ~{group}" if value is None and group in OPTIONAL_GROUPS else ""
     raise ConfigError(f"{group} takes {' or '.join(names) or 'a name'}, got {_shown(value)}{without}")
 

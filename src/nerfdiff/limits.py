@@ -81,6 +81,7 @@ LIMITS: dict[str, tuple[float, float, str]] = {
     "metrics.batch": AT_LEAST_1,
     "metrics.geometry.floater_*": AT_LEAST_1,
     "metrics.geometry.hull_margin": AT_LEAST_0,
+    "metrics.geometry.invisible": SHARE,
     "metrics.geometry.depth_tails": (0, math.nextafter(0.5, 0), "from 0 to less than 0.5"),
     "metrics.*.seed": (0, 2**32 - 1, "from 0 to 2^32 - 1"),
     "metrics.consistency.scenes": AT_LEAST_0,

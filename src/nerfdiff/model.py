@@ -2,19 +2,21 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
+from omegaconf import DictConfig
 from torch import Tensor, nn
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.diffusion.denoiser import Condition, Denoiser
 from nerfdiff.field.encoder import Encoding
-from nerfdiff.field.field import Field, PixelField, TriplaneField
-from nerfdiff.field.kinds import TRIPLANE, encoder_and_decoder
-from nerfdiff.field.triplane import Triplane
+from nerfdiff.field.field import Field
+from nerfdiff.field.kinds import TRIPLANE, field_kind, to_record
 from nerfdiff.render.renderer import RenderedViews, Renderer
+from nerfdiff.utils.config import plain
 from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.timing import timed
 
@@ -25,8 +27,7 @@ class NerfDiff(nn.Module):
     Args:
         name: of the size, for records.
         unet: sizes shared by the encoder and the CDM ("the image encoder retains the same architecture").
-        field: `name` of the single-image NeRF, a triplane where it is not given, and its settings
-            (`encoder_and_decoder`).
+        field: `name` of the single-image NeRF, a triplane where it is not given, and its settings (`field_kind`).
         render: the `Renderer`'s settings.
         conditioning: `image`, `ray_maps`, `cross_attention`, `residual_std` of the CDM, and a `name` for records.
 
@@ -37,14 +38,14 @@ class NerfDiff(nn.Module):
     def __init__(self, name: str, unet: Mapping, field: Mapping, render: Mapping, conditioning: Mapping):
         super().__init__()
         self.name = name
-        field, conditioning = dict(field), dict(conditioning)
+        conditioning = dict(conditioning)
         self.conditioning = conditioning.pop("name")
-        self.field_name = field.pop("name", TRIPLANE)
-        if self.field_name != TRIPLANE and conditioning["cross_attention"]:
+        self.field_name, self.kind = field.get("name", TRIPLANE), field_kind(field)
+        if conditioning["cross_attention"] and not self.kind.has_context:
             raise ConfigError(
                 f"field={self.field_name} has no U-Net features to attend to: set conditioning.cross_attention=false"
             )
-        self.encoder, self.decoder = encoder_and_decoder(self.field_name, field, unet)
+        self.encoder, self.decoder = self.kind.networks(unet)
         self.renderer = Renderer(**render)
         self.denoiser = Denoiser(**conditioning, unet=unet)
 
@@ -71,8 +72,7 @@ class NerfDiff(nn.Module):
 
     def field(self, encoding: Encoding) -> Field:
         """Return the radiance field of each scene."""
-        make = TriplaneField if isinstance(encoding.features, Triplane) else PixelField.of
-        return make(encoding.features, self.decoder)
+        return self.kind.field(encoding.features, self.decoder)
 
     def render(
         self,
@@ -104,6 +104,12 @@ class NerfDiff(nn.Module):
             for part in ("encoder", "decoder", "denoiser")
         }
         return parts | {"total": sum(parts.values())}
+
+
+def settings_of(cfg: DictConfig) -> dict[str, Any]:
+    """The arguments of `NerfDiff` in a training config, as checkpoints hold them."""
+    model = plain(cfg.model)
+    return model | {"field": to_record(model["field"]), "conditioning": plain(cfg.conditioning)}
 
 
 def build_on_meta(config: Mapping) -> NerfDiff:

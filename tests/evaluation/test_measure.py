@@ -17,8 +17,16 @@ from nerfdiff.evaluation.run import Orbit, RunSettings, Sheet
         (["ckpt=demo", "sweep=strategies", "strategy=ngd", "seed=1"], ["hydra.mode=RUN"]),
     ],
 )
-def test_the_command_says_to_a_shell_what_the_job_was_told(words, more):
-    hydra = OmegaConf.create({"job": {"config_name": "distill"}, "overrides": {"task": words}})
+@pytest.mark.parametrize("own", [None, "/tmp", "/home/a b/it's"])
+def test_the_command_says_to_a_shell_what_the_job_was_told(words, more, own):
+    sources = [
+        ("pkg", "hydra.conf", "hydra"),
+        ("file", "/conf", "main"),
+        *([("file", own, "command-line")] * bool(own)),
+    ]
+    sources = [dict(zip(("schema", "path", "provider"), source, strict=True)) for source in sources]
+    job = {"job": {"config_name": "distill"}, "overrides": {"task": words}, "runtime": {"config_sources": sources}}
+    hydra, more = OmegaConf.create(job), [*more, *([f'hydra.searchpath=["file://{own}"]'] if own else [])]
     said = shlex.split(_command(hydra))
     assert said == ["python", "src/distill.py", *more, *words]
     check_overrides("distill", said[2:])

@@ -38,13 +38,13 @@ def test_depth_errors_are_those_of_a_naive_loop():
 
 def test_depth_error_without_overlap_is_not_measured():
     ones, zeros = torch.ones(1, 4, 4), torch.zeros(1, 4, 4)
-    assert depth_errors(ones, zeros, ones) == ([None], [None])
-    assert depth_errors(ones, ones, zeros) == ([None], [None])
+    assert depth_errors(ones, zeros, ones, 0.5) == ([None], [None])
+    assert depth_errors(ones, ones, zeros, 0.5) == ([None], [None])
 
 
 def test_broken_depth_shows_as_nan():
     ones = torch.ones(1, 4, 4)
-    relative, rmse = depth_errors(ones * torch.nan, ones, ones)
+    relative, rmse = depth_errors(ones * torch.nan, ones, ones, 0.5)
     assert math.isnan(relative[0]) and math.isnan(rmse[0])
 
 
@@ -55,4 +55,4 @@ def test_mask_iou_counts_pixels():
     mask = torch.zeros(3, 4, 4, dtype=torch.bool)
     mask[0, 1:] = True  # rows 1 to 3
     mask[1, 0] = True
-    assert mask_iou(opacity, mask) == [pytest.approx(1 / 4), 0.0, 1.0]
+    assert mask_iou(opacity, mask, 0.5) == [pytest.approx(1 / 4), 0.0, 1.0]

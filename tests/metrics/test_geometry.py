@@ -14,7 +14,7 @@ RADIUS = 0.3
 
 def share(field, cameras, silhouettes, rays=10**9, margin=1, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    return floaters(field, RENDERER, cameras, silhouettes, NEAR, FAR, rays, margin, generator)
+    return floaters(field, RENDERER, cameras, silhouettes, NEAR, FAR, rays, margin, 1e-4, generator)
 
 
 @pytest.fixture(scope="module")

@@ -111,7 +111,7 @@ def test_geometry_is_measured_in_the_space_of_the_input_camera(folder):
     depth = pictures(cameras)[1]
     saved = load_field(folder / "a" / FIELD)
     draws = generator("cpu", 0, "floaters", "a")
-    expected = floaters(saved.field.field(), saved.renderer, cameras, depth > 0, NEAR, FAR, 16384, 1, draws)
+    expected = floaters(saved.field.field(), saved.renderer, cameras, depth > 0, NEAR, FAR, 16384, 1, 1e-4, draws)
     assert 0.3 < expected < 1
     assert summary["floaters"] == pytest.approx(expected, abs=1e-3)
     # half as deep in every view's own z: in the input camera's space, but in no other, this is its extent

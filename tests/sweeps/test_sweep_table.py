@@ -337,7 +337,7 @@ def test_the_frontier_is_of_one_device_and_of_each_quality(tmp_path):
         )
     groups = group(jobs_of(config), ["strategy"])
     found = lines_of(groups, BOOTSTRAP, {}, {}, [])
-    marked = Frontier("scene_s", {"psnr": "higher", "fd_st_vgg": "lower", "fid": "lower"})(groups, found)
+    marked = Frontier("scene_s", ["psnr", "fd_st_vgg", "fid"])(groups, found)
     assert {line.name: line.frontier for line in marked} == {
         "none": ("psnr", "fd_st_vgg"),
         "sds": ("fd_st_vgg",),  # another pays less for more PSNR
@@ -347,8 +347,8 @@ def test_the_frontier_is_of_one_device_and_of_each_quality(tmp_path):
     }
     rows = list(csv.DictReader(io.StringIO(to_csv(marked))))
     assert rows[1]["frontier"] == "fd_st_vgg" and "| PSNR, FD ST-VGG |" in to_markdown(marked)
-    with pytest.raises(ConfigError, match="psnr takes higher or lower"):
-        Frontier("scene_s", {"psnr": "up"})
+    with pytest.raises(ConfigError, match="psnrr is no metric; choose psnr"):
+        Frontier("scene_s", ["psnrr"])
 
 
 def test_terminal_and_pictures_show_the_frontier(swept, tmp_path, monkeypatch, capsys):
@@ -359,7 +359,7 @@ def test_terminal_and_pictures_show_the_frontier(swept, tmp_path, monkeypatch, c
     shown = []
     for module, name in ((sweep_grid, "grid"), (sweep_orbits, "orbits")):
         monkeypatch.setattr(module, name, lambda *arguments: shown.extend(arguments) and None)
-    callback = table(Frontier("distill_s", {"psnr": "higher"}))
+    callback = table(Frontier("distill_s", ["psnr"]))
     callback.on_multirun_start(OmegaConf.merge(swept, {"orbit": {}}))
     callback.on_multirun_end(OmegaConf.create())
     pictured = [[g.name for g in groups] for groups in shown if isinstance(groups, list)]

@@ -13,15 +13,24 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from nerfdiff.chart.page import write_page
-from nerfdiff.chart.payload import Measured, configuration_values, failure_values, failures, measured, share_words
+from nerfdiff.chart.payload import (
+    Measured,
+    charted,
+    configuration_values,
+    failure_values,
+    failures,
+    measured,
+    share_words,
+)
 from nerfdiff.chart.pictures import SmallSheets
 from nerfdiff.chart.png import write_png
 from nerfdiff.chart.published import published_for, read_published
 from nerfdiff.cli import command_words
+from nerfdiff.metrics.table import METRICS
 from nerfdiff.results.frame import (
-    CONFIGURATION_COLUMNS,
     RESULTS,
     Run,
+    configuration_columns,
     configuration_line,
     configurations,
     find_results,
@@ -80,7 +89,7 @@ def build_chart(cfg: DictConfig) -> Path:
             "nothing is shown from there (results= takes several folders)"
         )
     out = Path(cfg.out) if cfg.out is not None else _folder(places[0]) / "chart"
-    metrics, costs = _plain(cfg.metrics), _plain(cfg.costs)
+    metrics, costs = charted(), _plain(cfg.costs)
     bootstrap = instantiate(cfg.bootstrap)
     content = measured(configurations(found.runs, bootstrap, found.warn), metrics, costs, cfg.unnamed)
     papers = read_published(cfg.published)
@@ -90,8 +99,8 @@ def build_chart(cfg: DictConfig) -> Path:
     page = out / "index.html"
     small = SmallSheets(**_plain(cfg.pictures), warn=found.warn)
     values = _values(out, content, published, failed, small)
-    write_csv(out / "configurations.csv", CONFIGURATION_COLUMNS, map(configuration_line, content.found))
-    write_csv(out / "runs.csv", ("results", *COLUMNS), run_lines(found.runs))
+    write_csv(out / "configurations.csv", configuration_columns(), map(configuration_line, content.found))
+    write_csv(out / "runs.csv", list(dict.fromkeys(("results", *COLUMNS, *METRICS))), run_lines(found.runs))
     pictures = _pngs(cfg, out, content, published)
     counts = f"{len(found.runs)} runs, {len(content.found)} configurations, {len(failed)} failed runs"
     write_page(
@@ -197,7 +206,7 @@ def _pngs(cfg: DictConfig, out: Path, content: Measured, published: Sequence[lis
         raise ConfigError(f"png.costs: {', '.join(sorted(unknown))} is not among the fields of costs")
     written = []
     for number, (panel, entries) in enumerate(zip(content.panels, published, strict=True), 1):
-        for metric in _plain(cfg.metrics):
+        for metric in charted():
             for cost in cfg.png.costs:
                 if content.points(panel, metric["field"], cost):
                     path = out / f"{metric['field']}-{cost}{f'-{number}' * (number > 1)}.png"

@@ -12,6 +12,7 @@ import numpy as np
 from nerfdiff.chart.labels import labels_of, names_of
 from nerfdiff.chart.panels import Panel, panels_of
 from nerfdiff.chart.pictures import links
+from nerfdiff.metrics.table import METRICS
 from nerfdiff.results.frame import Configuration, Run, newest
 from nerfdiff.results.frontier import frontier
 from nerfdiff.results.intervals import Estimate
@@ -40,13 +41,22 @@ class Measured:
         return [n for n in panel.members if metric in self.estimates[n] and cost in self.estimates[n]]
 
 
+def charted() -> list[dict[str, Any]]:
+    """The metrics that the page can show, as it has them; what a cost has too is called the same."""
+    return [
+        {"field": m.name, "name": m.label, "unit": m.unit, "better": m.better, "within": m.within, "digits": m.digits}
+        for m in METRICS.values()
+        if m.within is not None
+    ]
+
+
 def measured(
     found: Sequence[Configuration],
     metrics: Sequence[Mapping[str, Any]],
     costs: Sequence[Mapping[str, Any]],
     unnamed: Sequence[str],
 ) -> Measured:
-    """What there is to show of `metrics` and `costs`; these and `unnamed` are those of conf/chart.yaml."""
+    """What there is to show of `metrics` (`charted`) and `costs`; these and `unnamed` are those of conf/chart.yaml."""
     scales = {metric["field"]: 1.0 for metric in metrics} | {cost["field"]: cost["scale"] for cost in costs}
     estimates = [_scaled(configuration.estimates, scales) for configuration in found]
     panels = panels_of(found)

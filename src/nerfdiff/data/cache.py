@@ -123,7 +123,7 @@ class CachedReader:
             if os.preadv(self._file, [image], row * image.nbytes) != image.nbytes:
                 raise self._damaged()
             if not self._checked[row]:
-                if hashlib.sha256(image).digest() != self._digests[row].tobytes():
+                if hashlib.sha256(np.ascontiguousarray(image)).digest() != self._digests[row].tobytes():
                     raise self._damaged()
                 self._checked[row] = True
         return pixels
@@ -189,12 +189,13 @@ def _write(reader: SceneReader, folder: Path) -> None:
         rows = slice(starts[index], starts[index + 1])
         c2w[rows], K[rows] = scene.cameras.c2w.numpy(), scene.cameras.K.numpy()
         bounds[index] = scene.near, scene.far
-        for row, image in zip(digests[rows], scene.pixels.numpy(), strict=True):
+        pixels = scene.pixels.contiguous().numpy()
+        for row, image in zip(digests[rows], pixels, strict=True):
             row[:] = np.frombuffer(hashlib.sha256(image).digest(), np.uint8)
         # written, not mapped: a full disk is then an error and no crash of the process
         with open(folder / "images.u8", "r+b") as file:
             file.seek(starts[index] * image_bytes)
-            file.write(scene.pixels.numpy().data)
+            file.write(pixels.data)
 
     (folder / "images.u8").touch()
     with ThreadPoolExecutor(min(MAX_THREADS, os.cpu_count() or 1)) as pool:

@@ -20,7 +20,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from nerfdiff.distill.trace import TRACE, Step
 from nerfdiff.metrics.predictions import read_plan
-from nerfdiff.metrics.summary import IMAGE_METRICS, SCENE_METRICS
+from nerfdiff.metrics.table import METRICS, Metric, named
 from nerfdiff.results import tensorboard
 from nerfdiff.results.row import ResultRow, flatten
 from nerfdiff.results.tensorboard import Layout
@@ -34,7 +34,6 @@ SETTINGS = (
     *("strategy", "dataset", "model", "field", "weights", "prior", "K", "samples_per_ray", "precision", "backend"),
     *("compile", "scenes_at_once", "seed", "device"),
 )
-ACCURACY = ("psnr", "ssim", "ssim_gaussian", "lpips", "st_lpips_vgg", "fid", "fd_st_vgg")
 PARTS = ("encode_s", "denoise_s", "fit_s", "guide_s", "render_s")
 PER_SCENE = ("denoiser_calls", "field_queries")
 
@@ -48,7 +47,7 @@ class Dashboard:
 
     Args:
         ignored: overrides that tell no runs apart, or what they begin with.
-        layout: of the custom scalars tab.
+        layout: of the custom scalars tab, beside the metrics (`accuracy_layout`).
     """
 
     ignored: Sequence[str]
@@ -70,7 +69,7 @@ class Dashboard:
             "config": tensorboard.code(OmegaConf.to_yaml(settings, resolve=HydraConfig.initialized()), "yaml"),
         }
         with _fresh(home / FOLDER / name) as writer:
-            tensorboard.begin(writer, hparams, texts, self.layout)
+            tensorboard.begin(writer, hparams, texts, accuracy_layout() | self.layout)
             for tag, value in _metrics(row).items():
                 writer.add_scalar(tag, value, 0)
             if sheet is not None:
@@ -83,6 +82,18 @@ class Dashboard:
                     for step, value in enumerate(values):
                         if value is not None and math.isfinite(value):
                             writer.add_scalar(tag, value, step)
+
+
+def accuracy_layout() -> Layout:
+    """Charts of the metrics that are compared, of each scene too, and of those that a run has one number of."""
+    shown = [metric for metric in METRICS.values() if metric.compared or metric.per == "run"]
+    charts = {", ".join(filter(None, (metric.label, metric.unit))): [_tag(metric)] for metric in shown}
+    scenes = {f"{m.label} of each scene": [f"scenes/{m.name}"] for m in shown if m.per != "run"}
+    return {"Accuracy": charts | scenes}
+
+
+def _tag(metric: Metric) -> str:
+    return f"{'details' if metric.detail else 'accuracy'}/{metric.name}"
 
 
 def show_in_dashboard(cfg: DictConfig, rows: Sequence[ResultRow], sheet: Path | None = None) -> None:
@@ -121,12 +132,10 @@ def _metrics(row: ResultRow) -> dict[str, float]:
     TensorBoard sorts tags by name, and its HPARAMS tab shows the first few until asked for more.
     """
     flat, scenes = flatten(row), row.n_scenes or 1
-    details = [name for name in (*IMAGE_METRICS, *SCENE_METRICS) if name not in ACCURACY]
-    values = {f"accuracy/{name}": flat[name] for name in ACCURACY}
+    values = {_tag(metric): row.measured(metric.name) for metric in METRICS.values()}
     values |= {"cost/scene_s": flat["scene_s_median"]}
     values |= {f"counts/{name}": None if flat[name] is None else flat[name] / scenes for name in PER_SCENE}
     values |= {f"counts/{name}": flat[name] for name in ("params", "peak_mem_bytes", "fallbacks")}
-    values |= {f"details/{name}": flat[name] for name in details}
     values |= {f"parts/{name}": flat[f"{name}_median"] for name in PARTS}
     return {tag: float(value) for tag, value in values.items() if value is not None and math.isfinite(value)}
 
@@ -142,7 +151,7 @@ def _traces(home: Path, row: ResultRow) -> dict[str, list[float | None]]:
 def _scenes(home: Path, row: ResultRow) -> dict[str, list[float | None]]:
     """Read the metrics of each scene, in the order of the scenes."""
     scenes = _read(home / row.folder / "scores" / row.strategy / "per_scene.csv")
-    return {f"scenes/{name}": [_mean([scene], name) for scene in scenes] for name in (*IMAGE_METRICS, *SCENE_METRICS)}
+    return {f"scenes/{name}": [_mean([scene], name) for scene in scenes] for name in named("image", "scene")}
 
 
 def _mean(lines: Sequence[Mapping[str, str]], column: str) -> float | None:

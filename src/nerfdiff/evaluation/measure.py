@@ -12,7 +12,7 @@ import filelock
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from nerfdiff.cli import command_words
+from nerfdiff.cli import SEARCHPATH, command_words
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.distill.strategy import Strategy
 from nerfdiff.evaluation.costs import cost_fields, model_fields
@@ -117,6 +117,9 @@ def _command(hydra: DictConfig) -> str:
     words = command_words(hydra.job.config_name)
     if any(word.startswith("sweep=") for word in hydra.overrides.task):
         words.append("hydra.mode=RUN")  # the settings of a sweep's jobs, and not the sweep again
+    given = [source for source in hydra.runtime.config_sources if "command-line" in source.provider]
+    if folders := [f"{source.schema}://{source.path}" for source in given]:  # of configs: --config-dir and the like
+        words.append(f"{SEARCHPATH}={json.dumps(folders)}")
     return shlex.join([*words, *hydra.overrides.task])
 
 

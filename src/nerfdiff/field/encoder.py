@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -16,6 +17,14 @@ from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.images import to_signed
 
 
+@runtime_checkable
+class Features(Protocol):
+    """W, of whatever kind: what a field is made of, and the bounds of each scene."""
+
+    near: Float[Tensor, "batch"]
+    far: Float[Tensor, "batch"]
+
+
 @dataclass(frozen=True)
 class Encoding:
     """Features of a scene, computed once per input image.
@@ -27,7 +36,7 @@ class Encoding:
     """
 
     source: Float[Tensor, "batch 3 height width"]
-    features: Triplane | PixelFeatures
+    features: Features
     context: Context
 
     @property

@@ -18,7 +18,7 @@ def depth_errors(
     depth: Float[Tensor, "n h w"],
     opacity: Float[Tensor, "n h w"],
     truth: Float[Tensor, "n h w"],
-    threshold: float = 0.5,
+    threshold: float,
 ) -> tuple[list[float | None], list[float | None]]:
     """Mean absolute relative error |d − d*| / d*, and RMSE in scene units, of each image.
 
@@ -38,7 +38,7 @@ def depth_errors(
     return relative, rmse
 
 
-def mask_iou(opacity: Float[Tensor, "n h w"], mask: Bool[Tensor, "n h w"], threshold: float = 0.5) -> list[float]:
+def mask_iou(opacity: Float[Tensor, "n h w"], mask: Bool[Tensor, "n h w"], threshold: float) -> list[float]:
     """Coverage of each image: intersection over union of `opacity > threshold` and `mask`; 1 if both are empty.
 
     Blank scenes have empty masks, and leaving them empty is right.

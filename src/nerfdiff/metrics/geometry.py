@@ -12,9 +12,6 @@ from nerfdiff.cameras import Cameras, Rays
 from nerfdiff.field.field import Field
 from nerfdiff.render.renderer import Renderer
 
-# Density that dims a ray by less than this between near and far is not worth looking up.
-INVISIBLE = 1e-4
-
 
 def outside_hull(
     points: Float[Tensor, "n 3"], cameras: Cameras, silhouettes: Bool[Tensor, "views h w"]
@@ -43,6 +40,7 @@ def floaters(
     far: float,
     rays: int,
     margin: int,
+    invisible: float,
     generator: torch.Generator,
 ) -> float | None:
     """Share of what the cameras see of a field that lies outside the visual hull of the true silhouettes: 0 is ideal.
@@ -57,6 +55,7 @@ def floaters(
         near, far: of the rays, in scene units.
         rays: drawn without replacement; all where there are no more.
         margin: pixels that silhouettes are widened by; they cut through the pixels of an edge.
+        invisible: density that dims a ray by less than this between near and far is not worth looking up.
         generator: of the draw, on the device of everything.
 
     Returns:
@@ -69,7 +68,7 @@ def floaters(
     def outside(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """The field, with "is outside" as its colour."""
         _, density = field(points, directions)
-        visible = density * (far - near) > INVISIBLE
+        visible = density * (far - near) > invisible
         flags = torch.zeros_like(density)
         flags[visible] = outside_hull(points[visible], cameras, widened).to(flags)
         return flags[..., None].expand(points.shape), density
@@ -80,7 +79,7 @@ def floaters(
     parts = (part.reshape(1, count, *part.shape[3:])[:, picked] for part in vars(all_rays).values())
     seen = replace(renderer, background=0.0).render(outside, Rays(*parts))
     mass = seen.opacity.double().sum()
-    return None if mass <= INVISIBLE * len(picked) else float(seen.rgb[..., 0].double().sum() / mass)
+    return None if mass <= invisible * len(picked) else float(seen.rgb[..., 0].double().sum() / mass)
 
 
 def heights(

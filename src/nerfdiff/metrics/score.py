@@ -2,8 +2,9 @@
 
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import UInt8
@@ -19,7 +20,9 @@ from nerfdiff.metrics.consistency import Consistency
 from nerfdiff.metrics.perceptual import LPIPS, LPIPS_NET, LPIPS_VGG, STLPIPS
 from nerfdiff.metrics.predictions import SCENE, Prediction, read_plan, read_prediction
 from nerfdiff.metrics.sets import FrechetDistance, InceptionFeatures, inception_weights
-from nerfdiff.metrics.summary import IMAGE_METRICS, SCENE_METRICS, SceneScores, Value, summarise, write_csv
+from nerfdiff.metrics.summary import FACTS, SceneScores, Value, summarise, write_csv
+from nerfdiff.metrics.table import METRICS, PACKAGE, named
+from nerfdiff.metrics.table import own as own_metrics
 from nerfdiff.metrics.whole_scene import Geometry, WholeScene
 from nerfdiff.utils.errors import DataError
 from nerfdiff.utils.files import encode, write_text
@@ -65,9 +68,11 @@ class Scorer:
         batch: images per pass through a network.
         geometry: how floaters and depth extent are measured.
         consistency: how the agreement of views is measured.
+        own: metrics of images of your own, see `table.own`.
 
     Raises:
         DataError: a weights file is damaged.
+        ConfigError: `own` describes no metrics.
     """
 
     def __init__(
@@ -84,10 +89,12 @@ class Scorer:
         batch: int,
         geometry: Geometry,
         consistency: Consistency,
+        own: Mapping[str, Mapping[str, Any]],
     ):
         self.psnr_floor, self.ssim_gaussian, self.st_lpips = psnr_floor, ssim_gaussian, st_lpips
         self.opacity_threshold, self.min_size, self.batch = opacity_threshold, min_size, batch
         self.whole_scene = WholeScene(geometry, consistency, opacity_threshold)
+        self.own = own_metrics(own)
         self.lpips_weights = LPIPS_VGG.find(lpips_weights) if lpips else None
         self.fid_weights = inception_weights(fid_weights) if fid else None
 
@@ -124,11 +131,13 @@ class Scorer:
         summary = summarise(scenes) | session.sets()
         summary["ssim_impl"] = image_metrics.SSIM_IMPL
         summary["lpips_net"] = LPIPS_NET if self.lpips_weights else None
+        described = {metric.name: {"value": summary[metric.name], **metric.description()} for metric in self.own}
+        summary = {name: value for name, value in summary.items() if name not in METRICS or METRICS[name] in PACKAGE}
+        summary["own_metrics"] = described or None
         rows = [row for scene in scenes for row in scene.image_rows()]
-        write_csv(out / "per_image.csv", ("scene", "view", *IMAGE_METRICS), rows)
+        write_csv(out / "per_image.csv", ("scene", "view", *named("image")), rows)
         per_scene = [scene.row() for scene in scenes]
-        columns = ("scene", "views", "status", "blank", *IMAGE_METRICS, *SCENE_METRICS)
-        write_csv(out / "per_scene.csv", columns, per_scene)
+        write_csv(out / "per_scene.csv", (*FACTS, *named("image", "scene")), per_scene)
         write_text(out / "summary.json", json.dumps(encode(summary), indent=1, allow_nan=False) + "\n")
         return summary
 
@@ -191,6 +200,7 @@ class _Session:
             distances, *features = self.st_lpips(*pair)
             values["st_lpips_vgg"] = distances.tolist()
             self.fd_st_vgg.update(*features)
+        values |= {metric.name: metric.measure(*pair).tolist() for metric in self.scorer.own}
         if self.inception:
             self.fid.update(self.inception(pixels), self.inception(true_pixels))
         return values

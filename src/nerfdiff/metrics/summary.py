@@ -7,24 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
 
+from nerfdiff.metrics.table import METRICS, PACKAGE, named
 from nerfdiff.utils.errors import DataError
 from nerfdiff.utils.files import atomic
 
-IMAGE_METRICS = (
-    "psnr",
-    "ssim",
-    "ssim_gaussian",
-    "lpips",
-    "st_lpips_vgg",
-    "sharpness",
-    "depth_abs_rel",
-    "depth_rmse",
-    "mask_iou",
-)
-SCENE_METRICS = ("floaters", "depth_extent", "consistency_psnr", "consistency_psnr_truth")
-
-FRECHET = ("fid", "fd_st_vgg")  # one number for all scenes of a run
-PER_SCENE = (*IMAGE_METRICS, *SCENE_METRICS)
+FACTS = ("scene", "views", "status", "blank")  # of a scene, beside its metrics
 LARGEST = 2**21  # bytes of a file of scores: of some 10,000 scenes
 
 Value = float | int | str | None
@@ -36,8 +23,8 @@ class SceneScores:
 
     Args:
         blank: all target images are white, so there is nothing to predict.
-        values: for each of `IMAGE_METRICS` that was measured, one value (or None) per view.
-        whole: those of `SCENE_METRICS` that were measured.
+        values: for each metric of images that was measured, one value (or None) per view.
+        whole: those of whole scenes that were measured.
         status: `ok`, or why the method fell back to something else.
     """
 
@@ -49,7 +36,7 @@ class SceneScores:
     status: str = "ok"
 
     def mean(self, metric: str) -> float | None:
-        return self.whole.get(metric) if metric in SCENE_METRICS else _mean(self.values.get(metric, ()))
+        return self.whole.get(metric) if METRICS[metric].per == "scene" else _mean(self.values.get(metric, ()))
 
     def image_rows(self) -> list[dict[str, Value]]:
         rows = []
@@ -59,9 +46,8 @@ class SceneScores:
         return rows
 
     def row(self) -> dict[str, Value]:
-        means = {m: self.mean(m) for m in (*IMAGE_METRICS, *SCENE_METRICS)}
-        facts = {"scene": self.scene_id, "views": len(self.views), "status": self.status, "blank": int(self.blank)}
-        return facts | means
+        facts = (self.scene_id, len(self.views), self.status, int(self.blank))
+        return dict(zip(FACTS, facts, strict=True)) | {m: self.mean(m) for m in named("image", "scene")}
 
 
 def summarise(scenes: Sequence[SceneScores]) -> dict[str, Value]:
@@ -74,11 +60,11 @@ def summarise(scenes: Sequence[SceneScores]) -> dict[str, Value]:
         "n_views": sum(len(scene.views) for scene in scenes),
         "blank_scenes": sum(scene.blank for scene in scenes),
     }
-    summary |= {m: _mean([scene.mean(m) for scene in scenes]) for m in (*IMAGE_METRICS, *SCENE_METRICS)}
+    summary |= {m: _mean([scene.mean(m) for scene in scenes]) for m in named("image", "scene")}
     summary["consistency_n"] = sum(scene.mean("consistency_psnr") is not None for scene in scenes) or None
     if summary["blank_scenes"]:
         others = [scene for scene in scenes if not scene.blank]
-        for m in ("psnr", "ssim", "lpips", "st_lpips_vgg"):
+        for m in (metric.name for metric in PACKAGE if metric.compared):
             summary[f"{m}_without_blank"] = _mean([scene.mean(m) for scene in others])
     return summary
 
@@ -115,7 +101,7 @@ def read_scores(path: Path) -> dict[str, dict[str, float]]:
             raise ValueError(f"{size} bytes are too many" if path.is_file() else "no file")
         with open(path, newline="", encoding="utf-8") as file:
             return {
-                line["scene"]: {name: float(line[name]) for name in PER_SCENE if line.get(name)}
+                line["scene"]: {name: float(cell) for name, cell in line.items() if name not in FACTS and cell}
                 for line in csv.DictReader(file)
             }
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:

@@ -20,7 +20,7 @@ class Geometry:
 
     Args:
         floater_views: true views that carve the hull and that rays are drawn from, at most, evenly spread.
-        floater_rays: see `geometry.floaters`.
+        floater_rays, invisible: see `geometry.floaters`.
         hull_margin: pixels that true silhouettes are widened by.
         depth_tails: share of surface points left out at either end of the depth extent.
         seed: of the rays.
@@ -29,6 +29,7 @@ class Geometry:
     floater_views: int
     floater_rays: int
     hull_margin: int
+    invisible: float
     depth_tails: float
     seed: int
 
@@ -54,7 +55,7 @@ class WholeScene:
         field: Path,
         device: torch.device,
     ) -> dict[str, float | None]:
-        """The metrics of `summary.SCENE_METRICS`; None or missing where they cannot be measured.
+        """The metrics of whole scenes in `table.METRICS`; None or missing where they cannot be measured.
 
         Args:
             number: of the scene among those predicted.
@@ -95,6 +96,7 @@ class WholeScene:
                     scene.far,
                     settings.floater_rays,
                     settings.hull_margin,
+                    settings.invisible,
                     generator(device, settings.seed, "floaters", scene.id),
                 )
         return values

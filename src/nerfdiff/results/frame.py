@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from nerfdiff.metrics.summary import FRECHET, PER_SCENE, read_scores
+from nerfdiff.metrics.summary import read_scores
+from nerfdiff.metrics.table import METRICS, named
 from nerfdiff.results.inside import inside
 from nerfdiff.results.intervals import Bootstrap, Estimate, spread
 from nerfdiff.results.row import RESULTS, ResultRow, RowFile, flatten
@@ -21,14 +22,11 @@ log = logging.getLogger(__name__)
 TIMINGS = ("scene_s", "distill_s", "denoise_s", "fit_s", "guide_s", "encode_s", "render_s")
 COUNTS = ("denoiser_calls", "field_queries")  # of all scenes of a run; a table has them per scene
 SIZES = ("peak_mem_bytes", "params", "timing_s")
-QUALITIES = (*PER_SCENE, *FRECHET)
 COSTS = (*TIMINGS, *COUNTS, *SIZES)
 IDENTITY = (
     "dataset", "split_sha256", "n_scenes", "n_views", "image_size", "ckpt_sha256", "weights", "model", "field",
     "strategy", "prior", "K", "samples_per_ray", "backend", "compile", "scenes_at_once", "precision", "device", "cpu",
 )  # fmt: skip
-MEASURED = tuple(f"{name}{end}" for name in (*QUALITIES, *COSTS) for end in ("", "_low", "_high"))
-CONFIGURATION_COLUMNS = (*IDENTITY, "seeds", "failed", "fallbacks", *MEASURED, "overrides", "results")
 
 
 @dataclass(frozen=True)
@@ -134,7 +132,7 @@ class Configuration:
 
     Args:
         failed: how many more of them there are that did not, on its device or before they had one.
-        estimates: of what was measured (`QUALITIES` and `COSTS`), by the names of `ResultRow`. Qualities with values
+        estimates: of what was measured (`METRICS` and `COSTS`), by the names of `ResultRow`. Qualities with values
             per scene: the mean over seeds and scenes and its bootstrap interval. Other qualities: the mean over
             seeds and their range. Timings: the mean over seeds of the medians, and of median ± half the interquartile
             range the lowest and the highest of any seed. Counts (per scene) and sizes: the mean over seeds and their
@@ -188,10 +186,16 @@ def configurations_frame(found: Sequence[Configuration]) -> pd.DataFrame:
     return pd.DataFrame([configuration_line(configuration) for configuration in found])
 
 
+def configuration_columns() -> list[str]:
+    """The names that `configuration_line` gives."""
+    measured = [f"{name}{end}" for name in (*METRICS, *COSTS) for end in ("", "_low", "_high")]
+    return [*IDENTITY, "seeds", "failed", "fallbacks", *measured, "overrides", "results"]
+
+
 def configuration_line(configuration: Configuration) -> dict[str, object]:
     """Who it is, then `<name>`, `<name>_low` and `<name>_high` of each estimate."""
     row = configuration.row
-    line: dict[str, object] = dict.fromkeys(CONFIGURATION_COLUMNS)
+    line: dict[str, object] = dict.fromkeys(configuration_columns())
     line |= {name: getattr(row, name) for name in IDENTITY}
     line["image_size"] = "x".join(map(str, row.image_size or ())) or None
     line |= {
@@ -216,7 +220,7 @@ def _attempt(run: Run) -> tuple:
 
 def _estimates(runs: Sequence[Run], bootstrap: Bootstrap, warn: Callable[[str], object]) -> dict[str, Estimate]:
     found = {}
-    for name in (*QUALITIES, *COUNTS, *SIZES):
+    for name in (*METRICS, *COUNTS, *SIZES):
         values = [value for run in runs if (value := _value(run.row, name)) is not None]
         if len(values) == len(runs):
             found[name] = spread(values)
@@ -233,7 +237,7 @@ def _estimates(runs: Sequence[Run], bootstrap: Bootstrap, warn: Callable[[str], 
 
 
 def _value(row: ResultRow, name: str) -> float | None:
-    value = getattr(row, name)
+    value = row.measured(name)
     if value is None or (name in COUNTS and not row.n_scenes):
         return None
     return value / row.n_scenes if name in COUNTS else float(value)
@@ -243,7 +247,8 @@ def _per_scene(runs: Sequence[Run], warn: Callable[[str], object]) -> tuple[list
     """Names of metrics, and their values (metrics, seeds, scenes) where every scene of every run has one."""
     scores = [_read_scenes(run, warn) for run in runs]
     scenes = sorted(set.intersection(*map(set, scores)))
-    names = [name for name in PER_SCENE if scenes and all(name in seed[scene] for seed in scores for scene in scenes)]
+    per_scene = named("image", "scene")
+    names = [name for name in per_scene if scenes and all(name in seed[scene] for seed in scores for scene in scenes)]
     values = [[[seed[scene][name] for scene in scenes] for seed in scores] for name in names]
     return names, np.array(values, dtype=np.float64)
 

@@ -12,13 +12,14 @@ import logging
 import math
 import os
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, make_dataclass, replace
 from dataclasses import field as has
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any, get_args
 
-from nerfdiff.utils.errors import DataError, some
+from nerfdiff.metrics.table import PACKAGE, TAKEN, Metric, register
+from nerfdiff.utils.errors import ConfigError, DataError, some
 from nerfdiff.utils.files import NONFINITE, encode
 
 log = logging.getLogger(__name__)
@@ -38,26 +39,12 @@ Timing = dict[str, float | int]
 PARTS = ("n", "median", "iqr")
 
 
+OwnMetrics = dict[str, dict[str, Any]]
+"""Somebody's own metrics, by name: `value`, and the arguments of `Metric` that describe them wherever the row goes."""
+
+
 @dataclass(kw_only=True, slots=True)
-class ResultRow:
-    """One measured run. None means not measured or not applicable.
-
-    `folder` is where predictions and scores lie, relative to the file of results. `command` makes the row again.
-    Timings are dicts {n, median, iqr} in seconds, see `timing`: `encode_s` per image, `render_s` per view (of all
-    predicted views of a scene in one call), the others per scene. `scene_s` is a scene from its input image to all its
-    predicted views, whatever the method; `distill_s` is that without encoding the image and rendering the views, of
-    methods that call the denoiser; `denoise_s` (denoiser calls), `fit_s` (field updates) and `guide_s` (renderings of
-    virtual views, which the denoiser sees and is guided by) are parts of it. `timing_s` are the seconds per scene that
-    measuring cost the run. `peak_mem_bytes` is what a GPU had allocated; on a CPU the process's resident set, with what
-    earlier jobs of a sweep left in it. `backend` is what rendered: `triton`, `torch`, or `cpu`, which is PyTorch in the
-    order that suits a CPU. `samples_per_ray` counts coarse and fine ones. `K` counts the virtual views that fields were
-    fitted to, the most of any scene. `fid_n` is the number of images on either side of `fid` and `fd_st_vgg`; `n_views`
-    counts all scored images; `consistency_n` scenes were measured for consistency. `fallbacks` counts the scenes whose
-    distillation failed and which kept an earlier field; `error` says how; where all did, the status is `diverged`. The
-    three after it are of the training run that made the checkpoint.
-    """
-
-    # identity
+class _Identity:
     schema_version: int = SCHEMA_VERSION
     run_id: str
     time: str | None = None
@@ -86,31 +73,38 @@ class ResultRow:
     backend: str | None = None
     compile: bool | None = None
     scenes_at_once: int | None = None
-    # metrics
-    psnr: float | None = None
-    ssim: float | None = None
+
+
+_WITHOUT_BLANK = [f"{metric.name}_without_blank" for metric in PACKAGE if metric.compared]
+_NUMBERS = [(name, float | None, None) for name in (*(metric.name for metric in PACKAGE), *_WITHOUT_BLANK)]
+
+
+@dataclass(kw_only=True, slots=True)
+class ResultRow(make_dataclass("_Measured", _NUMBERS, bases=(_Identity,), kw_only=True, slots=True)):
+    """One measured run. None means not measured or not applicable.
+
+    `folder` is where predictions and scores lie, relative to the file of results. `command` makes the row again.
+    Timings are dicts {n, median, iqr} in seconds, see `timing`: `encode_s` per image, `render_s` per view (of all
+    predicted views of a scene in one call), the others per scene. `scene_s` is a scene from its input image to all its
+    predicted views, whatever the method; `distill_s` is that without encoding the image and rendering the views, of
+    methods that call the denoiser; `denoise_s` (denoiser calls), `fit_s` (field updates) and `guide_s` (renderings of
+    virtual views, which the denoiser sees and is guided by) are parts of it. `timing_s` are the seconds per scene that
+    measuring cost the run. `peak_mem_bytes` is what a GPU had allocated; on a CPU the process's resident set, with what
+    earlier jobs of a sweep left in it. `backend` is what rendered: `triton`, `torch`, or `cpu`, which is PyTorch in the
+    order that suits a CPU. `samples_per_ray` counts coarse and fine ones. `K` counts the virtual views that fields were
+    fitted to, the most of any scene. `fid_n` is the number of images on either side of `fid` and `fd_st_vgg`; `n_views`
+    counts all scored images; `consistency_n` scenes were measured for consistency. `fallbacks` counts the scenes whose
+    distillation failed and which kept an earlier field; `error` says how; where all did, the status is `diverged`. The
+    three after it are of the training run that made the checkpoint.
+    """
+
+    # metrics, beside those of `METRICS`
     ssim_impl: str | None = None
-    ssim_gaussian: float | None = None
-    lpips: float | None = None
     lpips_net: str | None = None
-    fid: float | None = None
     fid_n: int | None = None
-    st_lpips_vgg: float | None = None
-    fd_st_vgg: float | None = None
-    sharpness: float | None = None
-    depth_abs_rel: float | None = None
-    depth_rmse: float | None = None
-    mask_iou: float | None = None
-    floaters: float | None = None
-    depth_extent: float | None = None
-    consistency_psnr: float | None = None
-    consistency_psnr_truth: float | None = None
     consistency_n: int | None = None
     blank_scenes: int | None = None
-    psnr_without_blank: float | None = None
-    ssim_without_blank: float | None = None
-    lpips_without_blank: float | None = None
-    st_lpips_vgg_without_blank: float | None = None
+    own_metrics: OwnMetrics | None = None
     # cost
     encode_s: Timing | None = None
     render_s: Timing | None = None
@@ -143,6 +137,10 @@ class ResultRow:
             raise ValueError(f"status {self.status!r} is unknown; choose one of {', '.join(STATUSES)}")
         if self.time is None:
             self.time = datetime.now(UTC).isoformat(timespec="seconds")
+
+    def measured(self, name: str) -> Any:
+        """A field, or the value of an own metric, by its name; None where it was not measured."""
+        return self.own_metrics[name]["value"] if name in (self.own_metrics or ()) else getattr(self, name, None)
 
 
 def append_row(path: str | Path, row: ResultRow) -> None:
@@ -385,6 +383,26 @@ def _size(value: Any) -> list[int] | None:
     return value if fits else None
 
 
+def _own_metrics(value: Any) -> OwnMetrics | None:
+    """Registered, so that tables and charts know them."""
+    if type(value) is not dict or len(value) > MANY:
+        return None
+    found = {}
+    for name, described in value.items():
+        if type(described) is not dict or name in TAKEN or "name" in described or "measure" in described:
+            return None
+        number = described.get("value")
+        decoded = None if number is None else _float(number)
+        if number is not None and decoded is None:
+            return None
+        try:
+            register(Metric(name, **{key: text for key, text in described.items() if key != "value"}))
+        except (TypeError, ConfigError):
+            return None
+        found[name] = described | {"value": decoded}
+    return found
+
+
 def _is(kind: type) -> Callable[[Any], Any]:
     return lambda value: value if type(value) is kind else None
 
@@ -397,6 +415,7 @@ ACCEPTED: dict[Any, tuple[str, Callable[[Any], Any]]] = {
     list[str]: (f"a list of at most {MANY} texts", _texts),
     list[int]: ("a height and a width", _size),
     Timing: ("a timing {n, median, iqr}", _timing),
+    OwnMetrics: ("metrics {name: {value, label, better, …}}", _own_metrics),
 }
 SEED = ("a whole number", lambda value: value if type(value) is int and abs(value) < 2**63 else None)
 # by the name in a file: the field's name (the same object every time, which makes rows fast), what it holds, and what
@@ -408,15 +427,18 @@ KINDS = {
 
 
 TIMINGS = {f.name: tuple(f"{f.name}_{part}" for part in PARTS) for f in fields(ResultRow) if f.type == Timing | None}
-COLUMNS = tuple(column for f in fields(ResultRow) for column in TIMINGS.get(f.name, (f.name,)))
+TAKEN.update(KINDS)
+COLUMNS = tuple(c for f in fields(ResultRow) if f.name != "own_metrics" for c in TIMINGS.get(f.name, (f.name,)))
 
 
 def flatten(row: ResultRow) -> dict[str, Any]:
-    """One scalar per column: timings become `<name>_n`, `_median` and `_iqr`, lists words."""
+    """One scalar per column: timings become `<name>_n`, `_median` and `_iqr`, lists words, own metrics columns."""
     flat: dict[str, Any] = {}
     for name in KINDS:
         value = getattr(row, name)
-        if name in TIMINGS:
+        if name == "own_metrics":
+            flat |= {own: metric["value"] for own, metric in (value or {}).items()}
+        elif name in TIMINGS:
             flat |= zip(TIMINGS[name], map((value or {}).get, PARTS), strict=True)
         else:
             flat[name] = " ".join(map(str, value)) if isinstance(value, list) else value

@@ -8,6 +8,7 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
+from nerfdiff.metrics.table import METRICS
 from nerfdiff.results.row import ResultRow, flatten
 from nerfdiff.results.text import markdown_lines, one_line
 from nerfdiff.utils.files import write_text
@@ -23,24 +24,8 @@ class Column:
     scale: float = 1
 
 
-COLUMNS = (
-    Column("strategy", "strategy"),
-    Column("psnr", "PSNR ↑", ".2f"),
-    Column("ssim", "SSIM ↑", ".3f"),
-    Column("ssim_gaussian", "SSIM (Gaussian) ↑", ".3f"),
-    Column("lpips", "LPIPS ↓", ".3f"),
-    Column("fid", "FID ↓", ".2f"),
-    Column("st_lpips_vgg", "ST-LPIPS ↓", ".3f"),
-    Column("fd_st_vgg", "FD ST-VGG ↓", ".2f"),
-    Column("sharpness", "sharpness (1)", ".2f"),
+COSTS = (
     Column("fid_n", "images"),
-    Column("depth_abs_rel", "depth abs rel ↓", ".3f"),
-    Column("depth_rmse", "depth RMSE ↓", ".3f"),
-    Column("mask_iou", "mask IoU ↑", ".3f"),
-    Column("floaters", "floaters ↓", ".3f"),
-    Column("depth_extent", "depth extent (1)", ".2f"),
-    Column("consistency_psnr", "consistency PSNR ↑", ".2f"),
-    Column("consistency_psnr_truth", "of truth", ".2f"),
     Column("encode_s_median", "encode, s", ".3g"),
     Column("render_s_median", "render, s/view", ".3g"),
     Column("distill_s_median", "distil, s", ".3g"),
@@ -56,6 +41,12 @@ COLUMNS = (
 )
 
 
+def all_columns() -> list[Column]:
+    """The strategy, all metrics, what they cost and where."""
+    metrics = [Column(metric.name, metric.heading, metric.format) for metric in METRICS.values()]
+    return [Column("strategy", "strategy"), *metrics, *COSTS]
+
+
 def cells(rows: Sequence[ResultRow]) -> tuple[list[str], list[list[str]]]:
     """Headings and cells of the columns that some row has a value for.
 
@@ -63,10 +54,10 @@ def cells(rows: Sequence[ResultRow]) -> tuple[list[str], list[list[str]]]:
     """
     flat = [flatten(row) for row in rows]
     failed = any(row.status != "ok" for row in rows)
-    columns = [c for c in COLUMNS if any(row[c.field] is not None for row in flat)]
+    columns = [c for c in all_columns() if any(row.get(c.field) is not None for row in flat)]
     if failed:
         columns.append(Column("status", "status"))
-    return [c.heading for c in columns], [[_cell(row[c.field], c) for c in columns] for row in flat]
+    return [c.heading for c in columns], [[_cell(row.get(c.field), c) for c in columns] for row in flat]
 
 
 def _cell(value: Any, column: Column) -> str:
@@ -96,7 +87,7 @@ def rich_table(rows: Sequence[ResultRow], width: int, title: str | None = None) 
         notes.append("too narrow for: " + ", ".join(heading for heading, _ in columns[len(shown) :]))
     caption = Text("\n".join(filter(None, notes)))  # names may have brackets, which are no markup
     table = Table(title=title and Text(one_line(title)), caption=caption if caption else None, caption_justify="left")
-    numeric = {c.heading for c in COLUMNS if c.format} | {"scenes", "seed", "images"}
+    numeric = {c.heading for c in all_columns() if c.format} | {"scenes", "seed", "images"}
     for heading, _, needed in shown:
         table.add_column(heading, justify="right" if heading in numeric else "left", width=needed)
     for line in zip(*(values for _, values, _ in shown), strict=True):

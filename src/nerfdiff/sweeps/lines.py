@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from nerfdiff.metrics.summary import FRECHET, PER_SCENE, read_scores
+from nerfdiff.metrics.summary import read_scores
+from nerfdiff.metrics.table import named
 from nerfdiff.results.intervals import Bootstrap, Estimate, mean_of, spread
 from nerfdiff.results.row import ResultRow
 from nerfdiff.sweeps.jobs import Group, Job, Labels, counterpart
 from nerfdiff.utils.errors import DataError
 
-PER_RUN = (*FRECHET, "distill_s", "scene_s")
+TIMINGS = ("distill_s", "scene_s")
 
 SceneValues = dict[str, float]
 
@@ -69,7 +70,7 @@ def lines_of(
         except DataError as error:
             values.append({})
             lost.append(f"{error}; the means are of its rows, without intervals over scenes")
-    sets = [_per_run([job.row for job in group.succeeded]) for group in groups]
+    sets = [_per_run([job.row for job in group.succeeded], (*named("run"), *TIMINGS)) for group in groups]
     lines = []
     for number, (group, scenes, runs) in enumerate(zip(groups, values, sets, strict=True)):
         other, aim = counterpart(group, groups, reference), counterpart(group, groups, goal)
@@ -88,7 +89,7 @@ def lines_of(
                 error=_error(group, lost[number]),
                 fallbacks=sum(job.row.fallbacks or 0 for job in group.succeeded),
                 metrics={metric: bootstrap(_array(by_scene)) for metric, by_scene in scenes.items()}
-                | (_per_run([job.row for job in group.succeeded], PER_SCENE) if lost[number] else {})
+                | (_per_run([job.row for job in group.succeeded], named("image", "scene")) if lost[number] else {})
                 | runs,
                 differences=differences,
                 closed=closed,
@@ -121,10 +122,10 @@ def _by_metric(scores: Mapping[str, Mapping[str, float]]) -> dict[str, SceneValu
     return values
 
 
-def _per_run(rows: Sequence[ResultRow], names: Sequence[str] = PER_RUN) -> dict[str, Estimate]:
+def _per_run(rows: Sequence[ResultRow], names: Sequence[str]) -> dict[str, Estimate]:
     found = {}
     for name in names:
-        values = [getattr(row, name) for row in rows if getattr(row, name) is not None]
+        values = [value for row in rows if (value := row.measured(name)) is not None]
         if values:
             found[name] = spread([float(value["median"] if isinstance(value, dict) else value) for value in values])
     return found
@@ -147,7 +148,7 @@ def _closed(
     runs: Mapping[str, Estimate], start: Mapping[str, Estimate], end: Mapping[str, Estimate]
 ) -> dict[str, float]:
     closed = {}
-    for name in FRECHET:
+    for name in named("run"):
         if name in runs and name in start and name in end and start[name].mean > end[name].mean:
             closed[name] = (start[name].mean - runs[name].mean) / (start[name].mean - end[name].mean)
     return closed

@@ -3,11 +3,12 @@
 import math
 import random
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from statistics import fmean
 from typing import TYPE_CHECKING
 
+from nerfdiff.metrics.table import METRICS
 from nerfdiff.results.row import ResultRow
 from nerfdiff.sweeps.proposals import Tried
 from nerfdiff.sweeps.space import Axis, Configuration, Space
@@ -16,7 +17,6 @@ from nerfdiff.utils.errors import ConfigError
 if TYPE_CHECKING:
     import optuna
 
-DIRECTIONS = ("minimize", "maximize")
 BRANCH = "branch"
 
 TRIES = 10
@@ -33,8 +33,8 @@ class Optuna:
         configurations: how many, those of earlier runs of the sweep included.
         startup: how many of them are drawn at random, before there is anything to learn from.
         seed: of all draws.
-        objectives: `minimize` or `maximize` by the field of `ResultRow`; of a timing it is the median. Each is the mean
-            over the seeds.
+        objectives: metrics, to be better, and other fields of `ResultRow`, to be less; of a timing it is the median.
+            Each is the mean over the seeds.
 
     Raises:
         ConfigError: a value is out of range, or Optuna is not installed.
@@ -43,18 +43,15 @@ class Optuna:
     configurations: int
     startup: int
     seed: int
-    objectives: Mapping[str, str]
+    objectives: Sequence[str]
 
     def __post_init__(self):
         where = "hydra.sweeper.proposals"
         if self.configurations < 1 or self.startup < 1:
             raise ConfigError(f"{where}: configurations and startup must be at least 1")
         known = {field.name for field in fields(ResultRow)}
-        for name, direction in self.objectives.items():
-            if name not in known:
-                raise ConfigError(f"{where}.objectives.{name} is no field of a result row")
-            if direction not in DIRECTIONS:
-                raise ConfigError(f"{where}.objectives.{name} takes {' or '.join(DIRECTIONS)}, got {direction!r}")
+        if unknown := [name for name in self.objectives if name not in known | METRICS.keys()]:
+            raise ConfigError(f"{where}.objectives: {unknown[0]} is no metric and no field of a result row")
         if not self.objectives:
             raise ConfigError(f"{where}.objectives is empty")
         try:
@@ -101,7 +98,7 @@ class Optuna:
                 constant_liar=True,  # the proposals of one batch are to differ
                 seed=self.seed + len(tried),  # with one seed every batch would begin with the same draws
             )
-        study = optuna.create_study(directions=list(self.objectives.values()), sampler=sampler)
+        study = optuna.create_study(directions=[_direction(name) for name in self.objectives], sampler=sampler)
         for configuration, rows in tried.items():
             if (number := space.branch_of(configuration)) is not None:
                 study.add_trial(self._trial(space, number, configuration, rows))
@@ -151,8 +148,12 @@ def _states() -> type["optuna.trial.TrialState"]:
     return optuna.trial.TrialState
 
 
+def _direction(name: str) -> str:
+    return "maximize" if name in METRICS and METRICS[name].sign > 0 else "minimize"
+
+
 def _number(row: ResultRow, name: str) -> float:
-    value = getattr(row, name)
+    value = row.measured(name)
     if value is None:
-        raise ConfigError(f"hydra.sweeper.proposals.objectives.{name} was not measured; choose another field")
+        raise ConfigError(f"hydra.sweeper.proposals.objectives: {name} was not measured; choose another")
     return float(value["median"] if isinstance(value, dict) else value)

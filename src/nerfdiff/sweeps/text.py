@@ -8,13 +8,13 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from nerfdiff.metrics.table import METRICS
 from nerfdiff.results.intervals import Estimate
-from nerfdiff.results.table import COLUMNS, Column
+from nerfdiff.results.table import Column, all_columns
 from nerfdiff.results.text import csv_lines, markdown_cell, markdown_lines, one_line
 from nerfdiff.sweeps.jobs import shown
 from nerfdiff.sweeps.lines import Line
 
-DIFFERENCES = ("psnr", "ssim", "lpips", "st_lpips_vgg")  # in tables for people; the CSV has all
 NOTE = (
     "Mean over seeds and scenes [bootstrap interval over scenes]; Δ to the reference, scene by scene. "
     "Fréchet distances and seconds: mean over seeds [range]. What was not measured is –."
@@ -72,10 +72,10 @@ def cells(lines: Sequence[Line]) -> tuple[list[str], list[list[str]]]:
     for key in dict.fromkeys(key for line in lines for key in line.labels):
         heading = key.rpartition(".")[2]
         add(heading, [shown(line.labels[key]) if key in line.labels else None for line in lines])
-    for column in COLUMNS:
+    for column in all_columns():
         name = column.field.removesuffix("_median")
         add(column.heading, [_estimate(line.metrics.get(name), column) for line in lines])
-        if name in DIFFERENCES:
+        if name in METRICS and METRICS[name].compared:  # the CSV has all
             add(f"Δ {column.heading}", [_estimate(line.differences.get(name), column, "+") for line in lines])
         add(f"paper: {column.heading}", [_number(line.paper.get(name), column) for line in lines])
         add(f"{column.heading.removesuffix(' ↓')} gap closed", [_share(line.closed.get(name)) for line in lines])
@@ -106,7 +106,7 @@ def _number(value: float | None, column: Column, sign: str = "") -> str | None:
 
 
 def _names(fields: Sequence[str]) -> str | None:
-    return ", ".join(column.heading.rstrip(" ↑↓") for column in COLUMNS if column.field in fields) or None
+    return ", ".join(column.heading.rstrip(" ↑↓") for column in all_columns() if column.field in fields) or None
 
 
 def _share(value: float | None) -> str | None:

@@ -29,6 +29,7 @@ from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.diffusion.layout import channels_last
 from nerfdiff.diffusion.unet import AUTO
 from nerfdiff.inputs import LAST, find_weights
+from nerfdiff.model import settings_of
 from nerfdiff.processes import lost_process, watch
 from nerfdiff.stopping import Stopped
 from nerfdiff.training.callbacks.checkpoint import ClearCheckpointIO
@@ -71,7 +72,7 @@ def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
     if trainer.is_global_zero:
         for folder in (output_dir, *(output_dir / name for name in ("checkpoints", "model", "previews", "snapshots"))):
             remove_leftovers(folder)
-    model_config = plain(cfg.model) | {"conditioning": plain(cfg.conditioning)}
+    model_config = settings_of(cfg)
     datamodule = instantiate(cfg.data)
     last = _checkpoint_to_resume(output_dir, cfg, model_config, datamodule)
     model_config = _within_memory(model_config, trainer, datamodule)

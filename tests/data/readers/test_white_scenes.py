@@ -105,7 +105,7 @@ def test_white_scenes(tmp_path, name):
         assert similarity(white, truth).tolist() == pytest.approx([1.0] * 4)
         assert similarity(grey, truth).isfinite().all()
     empty = torch.zeros(mask.shape)
-    assert mask_iou(empty, mask) == [1.0] * 4 and mask_iou(empty + 1, mask) == [0.0] * 4
+    assert mask_iou(empty, mask, 0.5) == [1.0] * 4 and mask_iou(empty + 1, mask, 0.5) == [0.0] * 4
     if case.has_depth:
         depth = batch.target_depth.flatten(0, 1)
-        assert depth_errors(empty + 5, empty + 1, depth) == ([None] * 4, [None] * 4)
+        assert depth_errors(empty + 5, empty + 1, depth, 0.5) == ([None] * 4, [None] * 4)

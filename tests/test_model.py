@@ -3,6 +3,7 @@ import torch
 
 from model_fixtures import input_cameras, model
 from nerfdiff.cli import load_config
+from nerfdiff.data.batch import ViewBatch
 from nerfdiff.model import build_on_meta, settings_of
 
 

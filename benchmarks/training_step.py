@@ -35,7 +35,7 @@ SWEEPS = {"batch": (1, 2, 4, 8, 16, 32)}
 class Alone(NerfDiffModule):
     """The module without a Trainer: there is nobody to log to."""
 
-    trainer = SimpleNamespace(max_steps=500_000)
+    trainer = SimpleNamespace(max_steps=500_000, callbacks=[])
 
     def log(self, *args, **kwargs) -> None:
         pass

@@ -23,7 +23,7 @@ from hydra.utils import instantiate
 import costs
 from harness import Row, Unavailable, Work, interleaved, parser, settings_of
 from inner_step import steps_of
-from nerfdiff.cli import load_config
+from nerfdiff.cli import CONF, load_config
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.distill.distillation import Distillation
 from nerfdiff.distill.virtual_views import VirtualViews
@@ -309,7 +309,7 @@ def _work(measured: Subject, budget: dict[str, int], setting: dict[str, int], st
 def _arguments(words):
     made = parser(__doc__, sweeps=tuple(SWEEPS))
     made.add_argument("--strategy", choices=STRATEGIES, default="ngd_current")
-    made.add_argument("--budget", choices=("minutes", "paper"), default="minutes")
+    made.add_argument("--budget", choices=sorted(path.stem for path in (CONF / "budget").iterdir()), default="minutes")
     made.add_argument("--scenes", type=int, default=1, help="distilled in one batch")
     made.add_argument("--steps", type=int, help="diffusion steps to time; default: all of the budget")
     made.add_argument("--extrapolate", action="store_true", help="from --steps to all of the budget's, and say so")

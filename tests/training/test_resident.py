@@ -58,7 +58,7 @@ def test_draws_visit_every_scene_and_never_pair_a_view_with_itself_unless_asked(
         assert len(set(row)) == 4
     again = draw_table(seed=3, draws=400, scenes=5, views=6, targets=3, sources=6, source_as_target=0.25)
     assert 60 < (again[:, 1] == again[:, 2]).sum() < 140
-    with pytest.raises(ConfigError, match="data.target_views=6"):
+    with pytest.raises(ConfigError, match=r"data\.target_views=6"):
         draw_table(0, 1, 1, 6, 6, 6, 0.0)
 
 

@@ -20,13 +20,14 @@ class FakeCuda(FakeTensorMode):
     """Fakes what is on a GPU alone.
 
     `copies` are the operations that brought something from the host to the GPU, `read` the number that is found where
-    one is read back: none, which is an error.
+    one is read back: none, which is an error; `rendering` and `norm` stand for the kernels.
     """
 
     def __init__(self):
         super().__init__(allow_non_fake_inputs=True)
         self.copies: list[str] = []
         self.read: float | None = None
+        self.rendering, self.norm = Nothing(), Nothing()
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         values, spec = tree_flatten((args, kwargs or {}))
@@ -39,6 +40,9 @@ class FakeCuda(FakeTensorMode):
             return func(*args, **kwargs | ({"pin_memory": None} if "pin_memory" in kwargs else {}))
         if func is torch.ops.aten._local_scalar_dense.default and self.read is not None:
             return self.read
+        if func.overloadpacket.__name__.startswith("_fused_adam"):  # there are no fakes of these
+            assert {tensor.device for tensor in tensors} == {DEVICE}
+            return None
         out = super().__torch_dispatch__(func, types, args, kwargs)
         copied = func.overloadpacket.__name__ in ("_to_copy", "copy_", "_copy_from")
         if copied and out.is_cuda and not all(tensor.is_cuda for tensor in tensors):
@@ -60,13 +64,16 @@ class Stream(torch.Generator):
 
 
 class Nothing:
-    """A kernel."""
+    """A kernel, with the number of its calls."""
+
+    def __init__(self):
+        self.calls = 0
 
     def __getitem__(self, grid):
         return self
 
     def __call__(self, *args, **kwargs):
-        return None
+        self.calls += 1
 
 
 @contextmanager
@@ -87,10 +94,11 @@ def fake_cuda() -> Iterator[FakeCuda]:
         "is_current_stream_capturing": lambda: False,
     }
     looks = ("_look", "_gradient", "draw_kernel", "composite_kernel", "composite_gradient_kernel")
+    mode = FakeCuda()
     norm_kernels = [name for name in dir(norms) if name.endswith("_kernel")]
     with (
         mock.patch.multiple(torch.cuda, **on_gpu),
-        mock.patch.object(torch.amp.autocast_mode, "amp_definitely_not_available", return_value=False),
+        mock.patch.object(torch.cuda.amp.common, "amp_definitely_not_available", return_value=False),
         mock.patch.object(torch, "Generator", Stream),
         mock.patch.object(Tensor, "backward", backward),
         mock.patch.object(nn.Module, "_apply", _apply),
@@ -98,9 +106,9 @@ def fake_cuda() -> Iterator[FakeCuda]:
         mock.patch.multiple(norm_silu, _told=set(), _give_up=_raise),
         mock.patch.multiple(backend, _told=set(), _failures={}, _COMPARED=(), _note_failure=_raise),
         mock.patch.object(inner_steps, "free_memory", return_value=2**40),
-        mock.patch.multiple(passes, **dict.fromkeys(looks, Nothing())),
-        mock.patch.multiple(norms, **dict.fromkeys(norm_kernels, Nothing())),
-        FakeCuda() as mode,
+        mock.patch.multiple(passes, **dict.fromkeys(looks, mode.rendering)),
+        mock.patch.multiple(norms, **dict.fromkeys(norm_kernels, mode.norm)),
+        mode,
     ):
         yield mode
 

@@ -81,6 +81,7 @@ def test_a_training_step(part, preconditioned, backend):
         with bf16():
             loss = module.training_step(batch, 0)
         loss.backward()
+        assert gpu.norm.calls and bool(gpu.rendering.calls) == (backend == "auto")
         # the times, which host and draw decide
         assert len(gpu.copies) == (part != "field")
         trained = [p for p in module.parameters() if p.requires_grad]
@@ -108,17 +109,18 @@ def test_a_resident_step_asks_nothing_of_the_host(frozen, backend):
         gpu.read = None
         for _ in range(2):
             step._step()
-        assert not gpu.copies
+        assert not gpu.copies and gpu.norm.calls and bool(gpu.rendering.calls) == (backend == "auto")
         assert all(p.grad.device == DEVICE for p in step.trained)
 
 
 @BACKENDS
 def test_evaluation(backend):
-    with fake_cuda(), torch.no_grad(), bf16():
+    with fake_cuda() as gpu, torch.no_grad(), bf16():
         model = made(sizes(backend)).eval()
         sampled = IndependentViews("cdm", 2, 1.0, 0.0, "uniform_lambda", "dpmpp_2m", 0.0, 4)
         for strategy in (SingleImageNeRF("none"), sampled):
             (predicted,) = strategy.predict(model, [views(1)], 0)
+            assert bool(gpu.rendering.calls) == (backend == "auto")
             assert predicted.images.device == DEVICE and predicted.images.shape == (2, 3, SIDE, SIDE)
 
 
@@ -153,4 +155,4 @@ def test_guide_and_inner_step(teacher, coarse, backend):
         gpu.copies.clear()
         module.training_step(0, 0)
         assert field.planes.grad.device == DEVICE and all(p.grad is not None for p in field.parameters())
-        assert len(gpu.copies) == 0
+        assert not gpu.copies and bool(gpu.rendering.calls) == (backend == "auto")

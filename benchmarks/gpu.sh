@@ -111,6 +111,7 @@ collect() {
     fi
     [ -d "$run" ] || return
     last=$(cd "$run" && ls -t snapshots/* 2> /dev/null | head -n 2)
+    # cat NAME_averages.tar.* | tar x
     tar -C "$run" -cf - $last $(cd "$run" && ls -d tensorboard) | split -d -b 15M - "$OUT/$1_averages.tar."
     say "$1 collected"
 }

@@ -8,9 +8,11 @@ measured in the same run.
 import argparse
 import math
 import os
+import signal
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -70,6 +72,10 @@ class Unavailable:
 
 
 Variant = Callable[[], Any] | Unavailable
+
+
+class Overrun(BaseException):
+    """A variant took more than its share of the time. Not for what falls back where kernels fail to catch."""
 
 
 @dataclass
@@ -138,12 +144,17 @@ def settings_of(
 
 
 def interleaved(variants: Mapping[str, Variant], device: torch.device, seconds: float) -> dict[str, Row]:
-    """Time variants in turn, after a warm-up, for about `seconds` each; one that fails, but for the first, says why,
-    and so does one whose turn comes after the deadline."""
+    """Time variants in turn, after a warm-up, for about `seconds` each; one that fails, but for the first, says why.
+
+    Before a deadline each has an equal share of the time that is left for its warm-up: one that takes longer is dropped
+    and says so, as does one whose turn comes after. One call of which takes longer than `seconds` is measured by its
+    last warm-up call, so that the others have their rounds.
+    """
     rows = {name: Row(name, {}) for name in variants}
     calls: dict[str, Callable[[], Any]] = {}
     repeats: dict[str, int] = {}
-    for name, variant in variants.items():
+    slow: dict[str, float] = {}
+    for number, (name, variant) in enumerate(variants.items()):
         if isinstance(variant, Unavailable):
             rows[name].reason = variant.reason
             continue
@@ -151,10 +162,17 @@ def interleaved(variants: Mapping[str, Variant], device: torch.device, seconds: 
             rows[name].reason = NO_TIME
             continue
         try:
-            repeats[name] = _warm_up(variant, device, seconds)
-            calls[name] = variant
+            with _within((DEADLINE.end - time.time()) / (len(variants) - number)):
+                last = _warm_up(variant, device, seconds)
+            print(f"  {name}: {last:.3g} s a call at first", flush=True)
+            if last > seconds and len(variants) > 1:
+                slow[name] = last
+            else:
+                repeats[name], calls[name] = max(1, math.ceil(SHORTEST / last)), variant
+        except Overrun as error:
+            rows[name].reason = str(error)
         except RuntimeError as error:
-            if not calls:
+            if not calls and not slow:
                 raise
             rows[name].reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
     times: dict[str, list[float]] = {name: [] for name in calls}
@@ -168,21 +186,43 @@ def interleaved(variants: Mapping[str, Variant], device: torch.device, seconds: 
             elapsed = _timed(call, device, repeats[name])
             times[name].append(elapsed / repeats[name])
             spent += elapsed
+    times |= {name: [last] for name, last in slow.items()}
     reference = times.get(next(iter(variants)))
     for name, own in times.items():
         rows[name].seconds = summarise(own)
-        if reference is not None:
+        if reference is not None and len(reference) == len(own):
             rows[name].ratio = statistics.median(r / o for r, o in zip(reference, own, strict=True))
+        elif reference is not None:
+            rows[name].ratio = statistics.median(reference) / statistics.median(own)
     return rows
 
 
-def _warm_up(call: Callable[[], Any], device: torch.device, seconds: float) -> int:
-    """Call until nothing new happens; how many calls make one measurement."""
+@contextmanager
+def _within(seconds: float) -> Iterator[None]:
+    """Raises Overrun in what takes longer."""
+
+    def stop(*_):
+        raise Overrun(f"dropped after {seconds:.3g} s, its share of the time")
+
+    if math.isinf(seconds):
+        yield
+        return
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _warm_up(call: Callable[[], Any], device: torch.device, seconds: float) -> float:
+    """Call until nothing new happens; seconds of the last call."""
     total, count, last = 0.0, 0, math.inf
     while count == 0 or (count < 3 and total < seconds / 3):
         last = _timed(call, device, 1)
         total, count = total + last, count + 1
-    return max(1, math.ceil(SHORTEST / last))
+    return last
 
 
 def _timed(call: Callable[[], Any], device: torch.device, repeats: int) -> float:

@@ -1,8 +1,11 @@
-"""What a benchmark leaves: a table on the terminal, a file that names model, hardware and date, a sweep's picture."""
+"""What a benchmark leaves: a table on the terminal, a file that names model, hardware and date, a sweep's picture.
+
+`python benchmarks/report.py FOLDER…` prints what is in such files."""
 
 import json
 import os
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -87,6 +90,26 @@ class Report:
         write_text(path, json.dumps(self._facts | measured, indent=1) + "\n")
 
 
+def table(folders: Sequence[Path]) -> str:
+    """One line for each row that is in the files of these folders, with what was not measured and why."""
+    lines = []
+    for path in (path for folder in folders for path in sorted(folder.glob("*.json"))):
+        content = json.loads(path.read_text())
+        lines += ["", " ".join((content["benchmark"], content["model"], "on", content["hardware"], content["time"]))]
+        lines += ["  " + ", ".join(f"{key} {value}" for key, value in content["settings"].items()), *content["notes"]]
+        lines += [] if content["complete"] else ["INCOMPLETE: stopped before all was measured"]
+        for row in content["rows"]:
+            if row["seconds"] is None:
+                lines.append(f"  {row['name']}: {row['reason']}")
+                continue
+            share = row["share_of_matrix_rate"]
+            rates = [] if share is None else [f"{100 * share:.1f} % of the matrix rate"]
+            rates += [] if row["ratio"] is None else [f"{row['ratio']:.2f} x reference"]
+            rates += [f"{key} {number(value)}" for key, value in row["more"].items()]
+            lines.append(f"  {row['name']}: {', '.join([duration(row['seconds']['median']), *rates])}")
+    return "\n".join(lines)
+
+
 def slug(text: str) -> str:
     """For a file name: lower case, and one dash for all that is neither letter nor digit."""
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
@@ -168,3 +191,7 @@ def _plot(path: Path, title: str, sweep: str, rows: Sequence[Row]) -> None:
     axes.legend(frameon=False)
     with atomic(path) as temporary:
         figure.savefig(temporary, dpi=100)
+
+
+if __name__ == "__main__":
+    print(table([Path(folder) for folder in sys.argv[1:]]))

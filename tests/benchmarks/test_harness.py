@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -162,3 +163,17 @@ def test_the_work_of_rendering_is_that_of_its_samples():
     by_hand = 5 * 12 * (3 * 4 * 2 * channels + 2 * channels * hidden + 2 * hidden * 4)
     assert work(8, 4, 5, False).flops == by_hand and work(6, 6, 5, True).flops == 3 * by_hand
     assert work(8, 4, 5, False).bytes == work(64, 64, 5, False).bytes  # samples need not leave the processor
+
+
+def test_a_variant_that_overruns_its_share_is_dropped_and_the_others_are_not(monkeypatch):
+    monkeypatch.setattr(harness.DEADLINE, "end", time.time() + 0.3)
+    rows = interleaved({"hangs": lambda: time.sleep(60), "works": lambda: None}, CPU, 0.001)
+    assert rows["hangs"].seconds is None and "its share of the time" in rows["hangs"].reason
+    assert rows["works"].seconds["n"] >= 1 and rows["works"].ratio is None
+
+
+def test_a_slow_variant_leaves_the_others_their_rounds(takes, capsys):
+    rows = interleaved({"slow": takes(5.0), "quick": takes(0.01)}, CPU, 1.0)
+    assert rows["slow"].seconds == {"n": 1, "median": 5.0, "iqr": 0.0}
+    assert rows["quick"].seconds["n"] > 50 and rows["quick"].ratio == pytest.approx(500)
+    assert "slow: 5 s a call at first" in capsys.readouterr().out

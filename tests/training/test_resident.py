@@ -1,5 +1,7 @@
 """Training from memory, on a CPU, where its steps run one by one."""
 
+import gc
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -150,3 +152,41 @@ def test_what_cannot_be_trained(begun, tmp_path, monkeypatch):
     monkeypatch.setattr(reader, "load", lambda index: whole(index, range(5 - (index == 1))))
     with pytest.raises(DataError, match=r"equally many views, and these have \[4, 5\]"):
         ResidentScenes.read(reader, None, torch.device("cpu"))
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+@pytest.mark.parametrize("backend", ["torch", "triton"])
+def test_a_step_leaves_nothing_that_only_the_garbage_collector_finds(begun, frozen, backend):
+    """Autograd's nodes among it would belong to another stream than the one on which a CUDA graph is recorded."""
+    _, scenes = scenes_of(begun[0])
+    torch.manual_seed(0)
+    model = NerfDiff(**config(render={"backend": backend, "uniform_samples": 4, "importance_samples": 2}))
+    autocast = torch.autocast("cpu", enabled=False)
+    field = FrozenField(model, scenes, 2, 2, autocast) if frozen else None
+    options = {"lr": 1e-3, "weight_decay": 0.0, "betas": [0.9, 0.99]}
+    step = Step(model, scenes, torch.tensor([[0, 1, 3]]), 1, field, options, 1.0, 7, autocast)
+    step.run(1e-3)
+    gc.collect()
+    gc.disable()
+    try:
+        step.run(1e-3)
+        gc.set_debug(gc.DEBUG_SAVEALL)
+        gc.collect()
+        assert not [one for one in gc.garbage if isinstance(one, torch.Tensor) and one.grad_fn is not None]
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()
+
+
+def test_of_a_recording_that_broke_the_first_cause_is_named(begun, tmp_path, monkeypatch, caplog):
+    def broken(step):
+        try:
+            raise RuntimeError("operation not permitted\nwhere it happened")
+        finally:
+            raise RuntimeError("previous error during capture")
+
+    monkeypatch.setattr(Step, "capture", broken)
+    monkeypatch.setattr(resident, "_records", lambda step: True)
+    train(begun, tmp_path, "steps=2", "eager_steps=1")
+    assert "operation not permitted; then previous error during capture" in caplog.text

@@ -1,4 +1,4 @@
-"""Train a small model from memory: `python src/train_resident.py init=runs/demo_checkpoint_field minutes=3`."""
+"""Train a small model from memory: `python src/train_resident.py init=demo fresh_cdm=true minutes=3`."""
 
 from omegaconf import DictConfig
 

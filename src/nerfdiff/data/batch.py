@@ -108,10 +108,11 @@ class ViewBatch:
         return self.target_pixels.float() / 255
 
     def to(self, device: torch.device | str, non_blocking: bool | None = None) -> "ViewBatch":
-        """Move every tensor; by default without waiting where that is safe, which is on the way to CUDA."""
+        """Move all tensors but the draws, which seed what the host draws; by default without waiting where that is
+        safe, which is on the way to CUDA."""
         if non_blocking is None:
             non_blocking = torch.device(device).type == "cuda"
-        return self._map(lambda tensor: tensor.to(device, non_blocking=non_blocking))
+        return replace(self._map(lambda tensor: tensor.to(device, non_blocking=non_blocking)), draws=self.draws)
 
     def pin_memory(self) -> "ViewBatch":
         """Copy to page-locked memory; `DataLoader` calls this."""

@@ -1,6 +1,6 @@
 """The ADM U-Net, for the image encoder (no time) and for the CDM (time, and attention to the encoder)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -182,35 +182,37 @@ class UNet(nn.Module):
                 features.append(h)
             return h
 
-        def level(depth: int, h: Tensor) -> Tensor:
-            """Run the U-Net at one resolution and all below it."""
-            skips = [h]
-            for stage in self._down(depth):
-                h = run(stage, h)
-                skips.append(h)
-            if depth == self.levels - 1:
-                for stage in self.middle:
-                    h = run(stage, h)
-            elif deep is not None and deep.reuse.below == depth + 1:
-                if deep.due:
-                    deep.last = below(depth, h)
-                h = deep.last
-            else:
-                h = below(depth, h)
-            for stage in self._up(depth):
-                h = run(stage, h, skips.pop())
-            return h
-
-        def below(depth: int, h: Tensor) -> Tensor:
-            down, up = self._between(depth)
-            return up(level(depth + 1, down(h)), h.shape[-2:])
-
-        h = level(0, self.conv_in(F.pixel_unshuffle(x, self.patch)))
+        h = self._level(0, self.conv_in(F.pixel_unshuffle(x, self.patch)), run, deep)
         return F.pixel_shuffle(self.conv_out(norm_silu(self.norm_out, h)), self.patch), features
 
     def keys_values(self, context: Sequence[Tensor]) -> list[KeyValue]:
         """Return the keys and values of another U-Net's features: a context that is computed once for many calls."""
         return [stage.cross.keys_values(features) for stage, features in zip(self._attending(), context, strict=True)]
+
+    # Methods, not functions that call each other: such a cycle would keep features, and the autograd nodes that made
+    # them, until Python happens to look for cycles.
+    def _level(self, depth: int, h: Tensor, run: Callable[..., Tensor], deep: DeepFeatures | None) -> Tensor:
+        """Run the U-Net at one resolution and all below it."""
+        skips = [h]
+        for stage in self._down(depth):
+            h = run(stage, h)
+            skips.append(h)
+        if depth == self.levels - 1:
+            for stage in self.middle:
+                h = run(stage, h)
+        elif deep is not None and deep.reuse.below == depth + 1:
+            if deep.due:
+                deep.last = self._below(depth, h, run, deep)
+            h = deep.last
+        else:
+            h = self._below(depth, h, run, deep)
+        for stage in self._up(depth):
+            h = run(stage, h, skips.pop())
+        return h
+
+    def _below(self, depth: int, h: Tensor, run: Callable[..., Tensor], deep: DeepFeatures | None) -> Tensor:
+        down, up = self._between(depth)
+        return up(self._level(depth + 1, down(h), run, deep), h.shape[-2:])
 
     def _attending(self) -> list[Stage]:
         """Return the stages with cross-attention, in the order in which they run."""

@@ -267,8 +267,8 @@ class NerfDiffModule(LightningModule):
         condition = self.model.condition(encoding, batch.target_cameras, rendered)
         targets = to_signed(batch.targets.flatten(0, 1))
         views = batch.target_cameras.shape[1]
-        each = (batch.draws[:, None] * views + torch.arange(views, device=batch.draws.device)).flatten()
-        times = spread_times(each, self.hparams.seed)
+        each = (batch.draws[:, None] * views + torch.arange(views)).flatten()
+        times = spread_times(each, self.hparams.seed).to(targets.device, non_blocking=True)
         return self._denoising_loss(condition, targets, eps.flatten(0, 1), times)
 
     def _denoising_loss(

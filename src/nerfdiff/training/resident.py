@@ -6,6 +6,7 @@ by one. The loss is `NerfDiffModule`'s; what is left out is what a run of minute
 validation, previews (evaluate.py does these afterwards, on the snapshots too).
 """
 
+import gc
 import logging
 import math
 import time
@@ -182,17 +183,34 @@ class Step:
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def capture(self, warm_up: int = 3) -> None:
-        """Record the step, after some that are made one by one; they count as steps."""
-        side = torch.cuda.Stream()
-        side.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(side):
-            for _ in range(warm_up):
-                self._step()
-        torch.cuda.current_stream().wait_stream(side)
-        self.optimizer.zero_grad(set_to_none=True)
+        """Record the step, after some that are made one by one; they count as steps.
+
+        All on one stream: autograd's nodes that add up gradients run on the stream on which they were made, and one
+        that is left of a step on the default stream breaks the recording. Hence no cycles that keep them, either.
+
+        Raises:
+            RuntimeError: it cannot be recorded; steps can be made one by one as before.
+        """
+        gc.collect()
+        here, aside = torch.cuda.current_stream(), torch.cuda.Stream()
+        aside.wait_stream(here)
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            self._step(clear=False)
+        try:
+            with torch.cuda.stream(aside):
+                for _ in range(warm_up):
+                    self._step()
+                self.optimizer.zero_grad(set_to_none=True)
+                with torch.cuda.graph(graph, stream=aside, capture_error_mode="thread_local"):
+                    self._step(clear=False)
+        except RuntimeError:
+            torch.cuda.synchronize()
+            # the generator still takes itself for recorded, and would refuse to draw
+            index = self.number.device.index or 0
+            fresh = torch.Generator(self.number.device).manual_seed(seed_of(self.seed, "not recorded"))
+            torch.cuda.default_generators[index].graphsafe_set_state(fresh)
+            raise
+        finally:
+            here.wait_stream(aside)
         self._graph = graph
 
     def run(self, lr: float) -> None:
@@ -360,7 +378,7 @@ def _model(cfg: DictConfig, begun: LoadedModel) -> NerfDiff:
 def _train(cfg: DictConfig, step: Step, averages: Averages) -> int:
     """Returns the number of steps."""
     options, output = plain(cfg.optimizer), Path(cfg.paths.output_dir)
-    cuda = step.number.is_cuda
+    records = _records(step)
     marks = _marks(sorted(cfg.snapshots), cfg)
     taken, mark = 0, next(marks)
     began = said = time.monotonic()
@@ -376,11 +394,11 @@ def _train(cfg: DictConfig, step: Step, averages: Averages) -> int:
             step.run(options["lr"] * fall * min(1.0, (taken + 1) / max(1, options["warmup_steps"])))
             taken += 1
             averages.update(taken)
-            if cuda and taken == cfg.eager_steps:
+            if records and taken == cfg.eager_steps:
                 try:
                     step.capture()
                 except RuntimeError as error:
-                    log.warning("the step is not recorded, and made kernel by kernel: %s", str(error).splitlines()[0])
+                    log.warning("the step is not recorded, and made kernel by kernel: %s", _causes(error))
             if taken % cfg.log_every_n_steps == 0:  # reading the losses waits for the device, so steps do not pile up
                 losses = {name: value.item() for name, value in step.losses.items()}
                 if not all(map(math.isfinite, losses.values())):
@@ -392,6 +410,20 @@ def _train(cfg: DictConfig, step: Step, averages: Averages) -> int:
                     log.info("step %d, %s, %.1f steps/s, %.0f %% done", taken, words, taken / (now - began), 100 * done)
                     said = now
     return taken
+
+
+def _records(step: Step) -> bool:
+    """Whether there are CUDA graphs here."""
+    return step.number.is_cuda
+
+
+def _causes(error: BaseException | None) -> str:
+    """What led to an error, first things first: the end of a broken recording hides what broke it."""
+    lines: list[str] = []
+    while error is not None:
+        lines.append((str(error).splitlines() or [type(error).__name__])[0])
+        error = error.__cause__ or error.__context__
+    return "; then ".join(reversed(lines))
 
 
 def _marks(shares: list[float], cfg: DictConfig) -> Iterator[float]:

@@ -101,14 +101,31 @@ def test_a_dataset_a_field_a_strategy_and_a_metric_from_training_to_the_chart(ow
 def test_a_prior_where_a_field_is_fitted(own, tmp_path, monkeypatch):
     tiny = ["budget=minutes", "budget.steps=1", "budget.inner_steps=1", "budget.views=2", "budget.rays=16"]
     few = ["sheet.scenes=0", "orbit.frames=0", "data.eval_scenes=1", "metrics.st_lpips=false", "per_scene=false"]
-    run(monkeypatch, distill, own, tmp_path, "ckpt=demo", "strategy=sds", "prior=arc", "weights=ema", *tiny, *few)
+    run(
+        monkeypatch,
+        distill,
+        own,
+        tmp_path,
+        "ckpt=demo",
+        "strategy=sds",
+        "prior=arc",
+        "weights=ema",
+        "data.image_size=64",
+        *tiny,
+        *few,
+    )
     (row,) = read_rows(tmp_path / "results.jsonl")
     assert (row.status, row.prior, row.K) == ("ok", "Arc", 2)
 
 
 def test_a_prior_is_the_datasets_own_or_the_sphere(own):
     search = f"hydra.searchpath=['file://{own / 'conf'}']"
-    for data, prior in (("boxes", "Sphere"), ("srn_chairs", "SRNSpiral"), ("clevr3d", "Circle"), ("abo", "OwnViews")):
+    for data, prior in (
+        ("boxes", "Sphere"),
+        ("srn_chairs", "SRNSpiral"),
+        ("clevr3d", "Circle"),
+        ("abo", "SceneCameras"),
+    ):
         for command in ("evaluate", "distill"):
             cfg = load_config(command, ["ckpt=demo", search, f"data={data}"])
             assert cfg.prior._target_ == f"nerfdiff.distill.priors.{prior}"
@@ -141,7 +158,7 @@ def test_nothing_but_a_kind_of_field_is_made_of_a_checkpoints_settings(settings,
         field_kind({"name": "fog"} | settings)
 
 
-@pytest.mark.parametrize("name", ["demo", "demo_64_field"])
+@pytest.mark.parametrize("name", ["demo", "demo_chairs"])
 def test_models_from_before_fields_had_a_target_are_read(name):
     model = load_model(name, "ema").model
     assert model.field_name == "triplane" and all(torch.isfinite(p).all() for p in model.parameters())

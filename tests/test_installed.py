@@ -87,7 +87,7 @@ def test_the_shipped_model_makes_a_scene_of_a_picture(site, shell, tmp_path):
     assert "WARNING" not in said  # of metrics that nobody asked for
 
 
-def test_shells_are_warned_what_completes_a_word(shell):
+def test_shells_are_told_what_completes_a_word(shell):
     assert shell("nerfdiff-train", "-sc", "install=bash").rstrip().endswith("hydra_bash_completion nerfdiff-train")
     completed = shell("nerfdiff-train", "-sc", "query=bash", COMP_LINE="nerfdiff-train model=")
     assert completed.split() == ["model=base", "model=large", "model=small", "model=tiny"]

@@ -42,7 +42,7 @@ def test_from_picture_to_field(tmp_path):
     source = reader.load(0, [64])
     saved = load_field(tmp_path / "out" / "field.safetensors")
     torch.testing.assert_close(saved.field.cameras.K, source.cameras.K, rtol=1e-3, atol=0)
-    own = Cameras(torch.eye(4)[None, None], source.cameras.K[None], 32, 32)
+    own = Cameras(torch.eye(4)[None, None], source.cameras.K[None], 64, 64)
     with torch.no_grad():
         rendered = saved.field.render(saved.renderer, own).images[0]
     assert psnr(rendered, source.images).item() > empty + 6

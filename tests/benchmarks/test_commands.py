@@ -102,7 +102,7 @@ def test_ngd_object_times_an_object_and_its_parts(tmp_path):
 def test_what_is_timed_in_part_is_said(tmp_path, monkeypatch):
     distil, made = Distillation.distil, []
     monkeypatch.setattr(
-        Distillation, "distil", lambda own, *a: made.append((own.coarse, own.cuda_graphs)) or distil(own, *a)
+        Distillation, "distil", lambda own, *a: made.append((own.fit.coarse, own.fit.cuda_graphs)) or distil(own, *a)
     )
     words = ["--sweep", "scenes", "--values", "2", "--steps", "1", "--whole", "--few", "--strategy", "sds"]
     content = run(ngd_object, tmp_path, *words)

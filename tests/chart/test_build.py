@@ -174,7 +174,7 @@ def test_names_have_no_constants_of_a_sweep_nor_places_and_nothing_twice(tmp_pat
         ([None, None], ["ngd run_id=0", "ngd run_id=1"]),
     ],
 )
-def test_what_differs_in_little_is_warned_apart_by_it(tmp_path, settings, names):
+def test_what_differs_in_little_is_told_apart_by_it(tmp_path, settings, names):
     rows = [result(overrides=words, run_id=str(number), precision="32-true") for number, words in enumerate(settings)]
     assert [entry["name"] for entry in content(chart(write_results(tmp_path, *rows)))["configurations"]] == names
 
@@ -187,7 +187,7 @@ def test_names_are_as_many_as_configurations(tmp_path):
     assert len(set(names)) == len(settings)
 
 
-def test_failed_runs_are_warned_and_keep_their_reason(tmp_path):
+def test_failed_runs_are_told_and_keep_their_reason(tmp_path):
     known = content(chart(write_results(tmp_path, result(), failed("slow", 4, status="nan", error="rgb of <b>"))))
     (entry,) = known["failures"]
     assert (entry["status"], entry["error"], entry["seed"]) == ("nan", "rgb of <b>", 4)
@@ -294,7 +294,7 @@ def test_a_file_that_is_named_twice_is_read_once(tmp_path, monkeypatch):
     assert len(known["configurations"][0]["runs"]) == 1
 
 
-def test_lines_that_are_no_rows_are_warned_and_cost_no_other(tmp_path):
+def test_lines_that_are_no_rows_are_told_and_cost_no_other(tmp_path):
     path = write_results(tmp_path / "a", result(), failed("slow")) / "results.jsonl"
     path.write_text('{"torn\n' + path.read_text() + "[[[\n")
     write_results(tmp_path / "b", result("best"))
@@ -350,7 +350,7 @@ def png_header(width: int, height: int) -> bytes:
     ],
     ids=["2.5 gigapixels", "169 megapixels", "torn", "PostScript", "empty", "pipe"],
 )
-def test_a_picture_that_cannot_be_shown_is_warned_and_costs_nothing(tmp_path, sheet, words):
+def test_a_picture_that_cannot_be_shown_is_told_and_costs_nothing(tmp_path, sheet, words):
     (tmp_path / "run").mkdir()
     if sheet is None:
         os.mkfifo(tmp_path / "run" / "sheet.png")
@@ -425,7 +425,7 @@ def test_runs_that_say_that_they_had_no_scenes_make_a_page(tmp_path):
     assert len(content(chart(write_results(tmp_path, result(n_scenes=0, n_views=0))))["configurations"]) == 1
 
 
-def test_a_folder_that_cannot_be_read_is_warned(tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_read_is_told(tmp_path, monkeypatch):
     write_results(tmp_path, result())
     locked = write_results(tmp_path / "locked", result("slow"))
     scandir = os.scandir

@@ -218,7 +218,7 @@ def test_what_the_legend_hides_stays_hidden_and_nothing_else_is(page):
     page.select_option("#colour", "strategy")
 
 
-def test_what_memory_is_on_a_cpu_is_warned(open_page, tmp_path):
+def test_what_memory_is_on_a_cpu_is_told(open_page, tmp_path):
     rows = [result(peak_mem_bytes=2**30), result("slow", peak_mem_bytes=2**31, device="GPU")]
     page = open_page(chart(write_results(tmp_path, *rows)))
     page.select_option("#cost", "peak_mem_bytes")
@@ -277,7 +277,7 @@ def test_clicking_shows_pictures_and_the_command(page):
     assert details.is_hidden()
 
 
-def test_a_lost_picture_is_warned(page):
+def test_a_lost_picture_is_told(page):
     details = click(page, NAMES.index("slow"))
     page.wait_for_selector("#details :text('not where it was when this page was written: ../slow0/orbit.mp4')")
     page.wait_for_function("document.querySelector('#details img').naturalWidth > 0")  # the one within the page

@@ -106,7 +106,7 @@ def test_images_of_several_sizes_are_an_error(root):
     assert cached(root, image_size=16).load(4).pixels.shape == (2, 3, 16, 16)
 
 
-def test_no_room_is_warned_before_decoding(root, monkeypatch):
+def test_no_room_is_told_before_decoding(root, monkeypatch):
     usage = namedtuple("usage", "total used free")(10, 10, 1000)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
     with pytest.raises(DataError, match=r"takes 148 kB, and 1 kB are free.*data\.cache_dir.*data\.cache=false"):

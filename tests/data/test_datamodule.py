@@ -152,7 +152,7 @@ def test_resuming_mid_run_gives_no_false_alarm(root, recwarn):
     assert not [str(w.message) for w in recwarn if "not resumable" in str(w.message)]
 
 
-def test_resuming_with_other_draws_is_warned(root, caplog):
+def test_resuming_with_other_draws_is_told(root, caplog):
     stopped = trainer(root, 2)
     stopped.fit(Recorder(), datamodule(root))
     stopped.save_checkpoint(root / "last.ckpt")

@@ -229,7 +229,7 @@ def test_specks_and_shades_of_white_change_nothing(tmp_path, name, share):
     assert (found[0] == 255).all() and (found[:, -1] == 255).all()
 
 
-def test_specks_of_a_mask_are_left_out_and_the_box_is_warned(tmp_path, caplog):
+def test_specks_of_a_mask_are_left_out_and_the_box_is_told(tmp_path, caplog):
     Image.fromarray(np.random.default_rng(0).integers(0, 200, (64, 64, 3), dtype=np.uint8)).save(tmp_path / "photo.png")
     mask = np.zeros((64, 64), np.uint8)
     mask[20:40, 10:30] = mask[44:50, 10:20] = 255  # a second part of 15 % is the object's

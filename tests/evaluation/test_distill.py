@@ -115,7 +115,7 @@ def test_k_is_the_number_of_views_that_fields_were_fitted_to(data, run, tmp_path
     assert none.K is none.prior is None
 
 
-def test_scenes_with_different_numbers_of_views_are_warned(data, run, tmp_path, monkeypatch, caplog):
+def test_scenes_with_different_numbers_of_views_are_told(data, run, tmp_path, monkeypatch, caplog):
     """The row's K is the most; a prior needs nothing but to be called."""
 
     class Odd:

@@ -18,7 +18,7 @@ from nerfdiff.evaluation.run import Orbit, RunSettings, Sheet
     ],
 )
 @pytest.mark.parametrize("own", [None, "/tmp", "/home/a b/it's"])
-def test_the_command_says_to_a_shell_what_the_job_was_warned(words, more, own):
+def test_the_command_says_to_a_shell_what_the_job_was_told(words, more, own):
     sources = [
         ("pkg", "hydra.conf", "hydra"),
         ("file", "/conf", "main"),

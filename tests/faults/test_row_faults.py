@@ -164,7 +164,7 @@ def test_no_damaged_line_ends_in_a_traceback_or_is_lost_without_a_word(tmp_path,
     fuzz(tmp_path, seed, lines=40, **({"png__costs": ["scene_s"]} if seed == 0 else {}))
 
 
-def test_every_value_in_every_field_is_a_row_or_is_warned(tmp_path):
+def test_every_value_in_every_field_is_a_row_or_is_told(tmp_path):
     row = asdict(result())
     path = tmp_path / "results.jsonl"
     lines = [json.dumps(row | {name: value}) for name in FIELDS for value in VALUES]

@@ -49,7 +49,7 @@ def test_the_numbers_of_a_dataset(inspected):
     assert "no val split" in val.absent and not val.failures
     assert (train.scenes, train.scenes_read, train.images_read) == (3, 2, 16)
     assert (train.views.low, train.views.high) == (10, 10)
-    assert (train.compared, test.compared) == (2, 2) and train.focal_warned
+    assert (train.compared, test.compared) == (2, 2) and train.focal_told
     assert train.sizes == {f"{HEIGHT} x {WIDTH}": 2}
     assert (train.focal.low, train.near.median, train.far.median) == (62.0, 0.8, 1.8)
     assert (test.masks, test.depths) == (2, 2)
@@ -141,7 +141,7 @@ def summary_of(root: Path, *overrides: str) -> SplitSummary:
 def test_what_silhouettes_do_not_tell_is_said(tmp_path):
     write_solids(tmp_path, {"train": 1})
     found = summary_of(tmp_path)
-    assert found.compared and not found.focal_warned and not found.failures
+    assert found.compared and not found.focal_told and not found.failures
     assert "focal length unchecked: silhouettes hardly change with it" in markdown("", [found])
 
 

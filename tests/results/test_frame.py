@@ -150,7 +150,7 @@ def test_tables_have_a_line_per_run_and_per_configuration(tmp_path):
     assert isinstance(runs_frame([]), pd.DataFrame) and configurations_frame([]).empty
 
 
-def test_damaged_scores_are_warned_and_the_rows_count(tmp_path):
+def test_damaged_scores_are_told_and_the_rows_count(tmp_path):
     write_scores(tmp_path / "run", "ngd", {"a": "many"})
     told = []
     (found,) = configurations(runs_of(tmp_path, result(folder="run")), BOOTSTRAP, told.append)

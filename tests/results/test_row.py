@@ -113,7 +113,7 @@ DAMAGED = {
 
 
 @pytest.mark.parametrize("line", DAMAGED, ids=range(len(DAMAGED)))
-def test_a_line_that_is_no_row_costs_no_other_and_is_warned(tmp_path, caplog, line):
+def test_a_line_that_is_no_row_costs_no_other_and_is_told(tmp_path, caplog, line):
     path = tmp_path / "results.jsonl"
     append_row(path, row(run_id="before"))
     with open(path, "a") as file:
@@ -125,7 +125,7 @@ def test_a_line_that_is_no_row_costs_no_other_and_is_warned(tmp_path, caplog, li
     assert caplog.messages == [str(file.skipped)] and len(caplog.messages[0]) < 500
 
 
-def test_many_lines_that_are_no_rows_are_counted_and_the_first_warned(tmp_path):
+def test_many_lines_that_are_no_rows_are_counted_and_the_first_told(tmp_path):
     path = tmp_path / "results.jsonl"
     path.write_bytes(b"\xff\xfe\n" * 50 + line_with().encode() + b'\n{"torn')
     file = RowFile(path)

@@ -105,7 +105,7 @@ def test_failures_do_not_end_a_sweep_and_are_tried_again_if_wanted(tmp_path, ret
     assert again.ran == (jobs([1]) if retry else [])
 
 
-def test_a_failure_that_nothing_took_note_of_is_warned_at_the_end(tmp_path):
+def test_a_failure_that_nothing_took_note_of_is_told_at_the_end(tmp_path):
     launcher = Here(tmp_path)
     launcher._run = lambda words: JobReturn(status=JobStatus.FAILED, _return_value=OSError(f"no {words[0]}"))
     with pytest.raises(CompactHydraException, match=r"12 jobs failed: .*no x=0"):

@@ -239,7 +239,7 @@ def test_a_job_has_nothing_outside_of_its_sweep(tmp_path, folder):
         job.own("predictions")
 
 
-def test_lines_that_are_no_rows_are_warned_below_the_table(swept, tmp_path, capsys, monkeypatch):
+def test_lines_that_are_no_rows_are_told_below_the_table(swept, tmp_path, capsys, monkeypatch):
     with open(tmp_path / "results.jsonl", "a") as file:
         file.write('{"torn\n[2]\n')
     monkeypatch.setattr(SweepTable, "_pictures", lambda *arguments: "none")

@@ -34,7 +34,7 @@ def labels_of(found: Sequence[Configuration], unnamed: Sequence[str]) -> list[Se
     """
     settings = [_settings(configuration) for configuration in found]
     keys = list(dict.fromkeys(key for values in settings for key in values if key != RUN))
-    twice = _warned_twice(settings, keys)
+    twice = _told_twice(settings, keys)
     where = [key for key in keys if any(f"{key}.".startswith(f"{name}.") for name in unnamed)]
     named = [key for key in keys if key not in {*twice, *where}]
     told = ["strategy", *_telling(settings, [key for key in named if key != "strategy"], [*twice, *where, RUN])]
@@ -53,14 +53,14 @@ def names_of(labels: Sequence[Settings]) -> list[str]:
         alike.setdefault(values["strategy"], []).append(number)
     names = [""] * len(labels)
     for strategy, members in alike.items():
-        for number, told in _warned_of(members, labels):
+        for number, told in _told_of(members, labels):
             short = _shortened(labels[number], ".")
             words = [f"{short[key]}={value}" for key, value in labels[number].items() if key in told]
             names[number] = " ".join([strategy, *words])
     return names
 
 
-def _warned_of(members: Sequence[int], labels: Sequence[Settings]) -> Iterator[tuple[int, set[str]]]:
+def _told_of(members: Sequence[int], labels: Sequence[Settings]) -> Iterator[tuple[int, set[str]]]:
     """For each member the labels to tell: that which fewest share with it, and so on among these.
 
     Members go through it together as long as they tell the same, so that each is counted a few times in all.
@@ -102,7 +102,7 @@ def _said(value: object) -> str:
     return value[:DIGITS] if isinstance(value, str) and len(value) == 64 else str(value)
 
 
-def _warned_twice(settings: Sequence[Settings], keys: Sequence[str]) -> list[str]:
+def _told_twice(settings: Sequence[Settings], keys: Sequence[str]) -> list[str]:
     """Keys of which another says as much.
 
     What it ran with says more than an override of that name, which may be `auto`, wherever that differs at all.

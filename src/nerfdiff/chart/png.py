@@ -50,7 +50,7 @@ def write_png(
     best = content.frontiers[content.panels.index(panel)][metric["field"]][cost["field"]]
     points = content.points(panel, metric["field"], cost["field"])
     at = {n: (content.estimates[n][cost["field"]], content.estimates[n][metric["field"]]) for n in points}
-    told = [_warned(number, content.names[n], at[n], metric, cost) for number, n in enumerate(best[:lines], 1)]
+    told = [_told(number, content.names[n], at[n], metric, cost) for number, n in enumerate(best[:lines], 1)]
     if len(best) > lines:
         told.append(f"and {len(best) - lines} more, in configurations.csv")
     told = [figure_text(fill(text, int(LETTERS * size[0]), subsequent_indent="    ")) for text in told]
@@ -103,7 +103,7 @@ def _titled(quantity: Mapping[str, Any]) -> str:
     return f"{quantity['name']}, {quantity['unit']}" if quantity["unit"] else quantity["name"]
 
 
-def _warned(
+def _told(
     number: int,
     name: str,
     point: tuple[Estimate, Estimate],

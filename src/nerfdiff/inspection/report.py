@@ -32,7 +32,7 @@ def _some_of(count: int, total: int) -> str:
     return "no" if count == 0 else "yes" if count == total else f"{count} of {total}"
 
 
-def _warned(text: str) -> str:
+def _told(text: str) -> str:
     """For the terminal: names of data are no markup."""
     return escape(one_line(text))
 
@@ -40,18 +40,18 @@ def _warned(text: str) -> str:
 def print_report(console: Console, title: str, splits: Sequence[SplitSummary], limit: int) -> None:
     """Tables of facts and of checks, then bad and suspect scenes (at most `limit` of each split)."""
     there = [split for split in splits if not split.absent and not split.error]
-    table = Table(title=_warned(title))
+    table = Table(title=_told(title))
     for heading in FACTS:
         table.add_column(heading)
     for split in there:
-        table.add_row(*map(_warned, facts(split)))
+        table.add_row(*map(_told, facts(split)))
     checks = Table()
     for heading in ("split", "check", "result", "found"):
         checks.add_column(heading)
     for split in there:
         for found in split.checks:
             colour = COLOURS[found.status]
-            checks.add_row(split.stage, found.check, f"[{colour}]{found.status}[/]", _warned(found.text))
+            checks.add_row(split.stage, found.check, f"[{colour}]{found.status}[/]", _told(found.text))
         checks.add_section()
     if there:
         console.print(table, checks)
@@ -59,15 +59,15 @@ def print_report(console: Console, title: str, splits: Sequence[SplitSummary], l
         if split.absent or split.error:
             colour = "yellow" if split.absent else "bold red"
             state = "not there" if split.absent else "cannot be read"
-            console.print(f"[{colour}]{split.stage}: {state}[/]: {_warned(split.absent or split.error)}", soft_wrap=True)
+            console.print(f"[{colour}]{split.stage}: {state}[/]: {_told(split.absent or split.error)}", soft_wrap=True)
         for scene, reason in list(split.bad.items())[:limit]:
-            console.print(f"[bold red]bad scene[/] {split.stage} {_warned(f'{scene}: {reason}')}", soft_wrap=True)
+            console.print(f"[bold red]bad scene[/] {split.stage} {_told(f'{scene}: {reason}')}", soft_wrap=True)
         if len(split.bad) > limit:
             console.print(f"  and {len(split.bad) - limit} more bad scenes, all in the report")
         for line in _suspects(split)[:limit]:
-            console.print(f"[yellow]suspect[/] {split.stage} {_warned(line)}", soft_wrap=True)
+            console.print(f"[yellow]suspect[/] {split.stage} {_told(line)}", soft_wrap=True)
         for line in _notes(split):
-            console.print(f"[bold]{split.stage}[/]: {_warned(line)}", soft_wrap=True)
+            console.print(f"[bold]{split.stage}[/]: {_told(line)}", soft_wrap=True)
 
 
 def write_report(folder: Path, title: str, splits: Sequence[SplitSummary]) -> list[Path]:
@@ -113,7 +113,7 @@ def _notes(split: SplitSummary) -> list[str]:
         ]
     elif split.compared < split.scenes_read:
         notes = [f"cameras unchecked in {split.scenes_read - split.compared} of {split.scenes_read} scenes"]
-    if split.compared and not split.focal_warned:
+    if split.compared and not split.focal_told:
         notes.append("focal length unchecked: silhouettes hardly change with it; compare it with the data's source")
     if split.explanations is None or not any(found.status is Status.FAILED for found in split.checks):
         return notes  # a few suspects are no reason to doubt all cameras

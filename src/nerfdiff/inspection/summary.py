@@ -42,7 +42,7 @@ class SplitSummary:
         focal: in pixels, along x; `fov` in degrees across the larger side.
         masks, depths: how many of the scenes read have them.
         compared: for how many of the scenes read some check could compare cameras with images.
-        focal_warned: whether one of those checks notices a wrong focal length.
+        focal_told: whether one of those checks notices a wrong focal length.
         allow_unchecked: whether the split may pass where none was compared.
     """
 
@@ -63,7 +63,7 @@ class SplitSummary:
     depths: int = 0
     checks: tuple[Verdict, ...] = ()
     compared: int = 0
-    focal_warned: bool = False
+    focal_told: bool = False
     allow_unchecked: bool = False
     bad: dict[str, str] = field(default_factory=dict)
     explanations: list[str] | None = None
@@ -114,7 +114,7 @@ def summarise_split(
         depths=sum(r.depth for r in records),
         checks=tuple(verdicts),
         compared=sum(map(bool, comparing)),
-        focal_warned=any(checks[name].tells_focal for names in comparing for name in names),
+        focal_told=any(checks[name].tells_focal for names in comparing for name in names),
         allow_unchecked=allow_unchecked,
         bad=dict(survey.bad),
         explanations=survey.explanations,

@@ -66,9 +66,9 @@ class SweepTable(Callback):
         except Exception as error:
             log.exception("this job of the sweep failed")
             job_return.status, job_return.return_value = JobStatus.COMPLETED, None
-            self._warned(partial(self._record, config, error))
+            self._told(partial(self._record, config, error))
         if time.time() - self._written >= self.pause:
-            self._warned(self._write)
+            self._told(self._write)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Hydra lets no Exception of a callback end the command: without a table, or any success, it is an exit."""
@@ -85,7 +85,7 @@ class SweepTable(Callback):
         path = Path(self.sweep.hydra.sweep.dir) / TABLE
         return path.stat().st_mtime if path.is_file() else 0.0
 
-    def _warned(self, work: Callable[[], object]) -> None:
+    def _told(self, work: Callable[[], object]) -> None:
         try:
             work()
         except UserError as error:

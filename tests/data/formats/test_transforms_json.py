@@ -90,7 +90,7 @@ def test_views_are_in_natural_order(tmp_path):
     assert [f.name for f in read_transforms(tmp_path).frames] == ["r_1", "r_2", "r_3", "r_10", "r_33", "r_100"]
 
 
-def test_names_that_occur_twice_are_warned_apart_by_their_folders(tmp_path):
+def test_names_that_occur_twice_are_told_apart_by_their_folders(tmp_path):
     write_nerfstudio(tmp_path, views=2)
     edit(tmp_path, frame_edit(1, file_path="./images_b\\frame_00001.png"))
     found = read_transforms(tmp_path).frames

@@ -87,7 +87,7 @@ def test_scene_holds_exactly_what_was_written(root, bits):
 
 
 @pytest.mark.parametrize("form", ["opengl", "opencv", "opengl inverted", "opencv inverted"])
-def test_conventions_are_warned_apart(root, form, caplog):
+def test_conventions_are_told_apart(root, form, caplog):
     caplog.set_level(logging.INFO)
 
     def written(pose):

@@ -21,7 +21,7 @@ from nerfdiff.utils.errors import ConfigError
 
 DOCS = Path(__file__).parents[1] / "docs" / "extending.md"
 QUIET = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
-SIZE = 32
+SIZE = 64  # ckpt=demo
 
 
 @pytest.fixture(scope="module")
@@ -101,19 +101,7 @@ def test_a_dataset_a_field_a_strategy_and_a_metric_from_training_to_the_chart(ow
 def test_a_prior_where_a_field_is_fitted(own, tmp_path, monkeypatch):
     tiny = ["budget=minutes", "budget.steps=1", "budget.inner_steps=1", "budget.views=2", "budget.rays=16"]
     few = ["sheet.scenes=0", "orbit.frames=0", "data.eval_scenes=1", "metrics.st_lpips=false", "per_scene=false"]
-    run(
-        monkeypatch,
-        distill,
-        own,
-        tmp_path,
-        "ckpt=demo",
-        "strategy=sds",
-        "prior=arc",
-        "weights=ema",
-        "data.image_size=64",
-        *tiny,
-        *few,
-    )
+    run(monkeypatch, distill, own, tmp_path, "ckpt=demo", "strategy=sds", "prior=arc", "weights=ema", *tiny, *few)
     (row,) = read_rows(tmp_path / "results.jsonl")
     assert (row.status, row.prior, row.K) == ("ok", "Arc", 2)
 

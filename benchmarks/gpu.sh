@@ -56,7 +56,7 @@ part1() {
         done
     done
     total=$((3 + 2 * ${#jobs[@]}))
-    step 3 tests $python -m pytest -q -p no:cacheprovider --maxfail=1000 ${WORKERS:+-n $WORKERS} ${TESTS:-$tests}
+    step 3 tests $python -m pytest -p no:cacheprovider --maxfail=1000 ${WORKERS:+-n $WORKERS} ${TESTS:-$tests}
     for job in "${jobs[@]}"; do
         # shellcheck disable=SC2086
         set -- $job

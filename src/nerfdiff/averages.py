@@ -8,11 +8,49 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor
 
 from nerfdiff.utils.errors import CheckpointError, ConfigError
+from nerfdiff.utils.files import atomic
+
+
+class PowerAverages:
+    """Averages of weights with power-function profiles, one per length, while training runs.
+
+    Args:
+        lengths: relative standard deviations σ_rel, shares of the training so far.
+        values: averages so far, per length in the order of the parameters; None begins with the first update.
+
+    Raises:
+        ConfigError: a length that no average has.
+    """
+
+    def __init__(self, lengths: Sequence[float], values: dict[str, list[Tensor]] | None = None):
+        self.exponents = {str(length): exponent_of(length) for length in lengths}
+        self.values = values or {}
+
+    @torch.no_grad()
+    def update(self, parameters: Sequence[Tensor], step: int) -> None:
+        """Average the weights after optimizer step number `step`, counted from 1.
+
+        Eq. 127: θ̂_t = β_t θ̂_{t-1} + (1 - β_t) θ_t with β_t = (1 - 1/t)^(γ+1).
+        """
+        current = [parameter.detach() for parameter in parameters]
+        for length, exponent in self.exponents.items():
+            if length not in self.values:
+                self.values[length] = [value.clone() for value in current]
+            torch._foreach_lerp_(self.values[length], current, 1 - (1 - 1 / step) ** (exponent + 1))
+
+    def save(self, folder: Path, names: Sequence[str], step: int) -> None:
+        """Write `step_<n>_<length>.safetensors` (fp16), which `average_of` reads."""
+        for length, values in self.values.items():
+            state = {n: v.to("cpu", torch.float16).contiguous() for n, v in zip(names, values, strict=True)}
+            with atomic(folder / f"step_{step:07d}_{length}.safetensors") as temporary:
+                save_file(state, temporary, {"step": str(step), "length": length})
 
 
 def exponent_of(length: float) -> float:

@@ -115,7 +115,9 @@ def test_the_cdm_alone_is_trained_and_the_average_exported(begun, tmp_path):
         assert torch.allclose(value, loaded.model.state_dict()[name], atol=1e-3), name
     seen = loaded.trained_on[-1]
     assert (seen["part"], seen["images"], seen["scenes"]) == ("CDM", 8 * 2 * 2, 3)
-    assert len(list((tmp_path / "snapshots").iterdir())) == 2 * 5
+    # of 8 steps: the first at or after each share of the training
+    files = {f"step_{step:07d}_{length}.safetensors" for step in (1, 2, 4, 8) for length in (0.05, 0.1)}
+    assert {path.name for path in (tmp_path / "snapshots").iterdir()} == files
 
 
 def test_joint_training_with_another_conditioning_and_a_new_cdm(begun, tmp_path):
@@ -129,6 +131,31 @@ def test_joint_training_with_another_conditioning_and_a_new_cdm(begun, tmp_path)
         if name.startswith("encoder.") and value.numel() > 1
     ]
     assert sum(changed) > len(changed) / 2
+
+
+def test_draws_that_come_again_have_other_times(begun, monkeypatch):
+    """The table has two steps; the golden-ratio sequence of times goes on."""
+    _, scenes = scenes_of(begun[0])
+    seen = []
+    times = resident.spread_times
+    monkeypatch.setattr(resident, "spread_times", lambda draws, seed: seen.append(times(draws, seed)) or seen[-1])
+    torch.manual_seed(0)
+    table = torch.tensor([[0, 1, 2], [1, 0, 2]])
+    autocast = torch.autocast("cpu", enabled=False)
+    step = Step(
+        NerfDiff(**config()),
+        scenes,
+        table,
+        1,
+        None,
+        {"lr": 1e-3, "weight_decay": 0.0, "betas": [0.9, 0.99]},
+        1.0,
+        7,
+        autocast,
+    )
+    for _ in range(5):
+        step.run(1e-3)
+    assert step.taken == 5 and len({float(t) for t in seen}) == 5
 
 
 def test_it_learns(begun, tmp_path):
@@ -147,6 +174,17 @@ def test_what_cannot_be_trained(begun, tmp_path, monkeypatch):
         train(begun, tmp_path, "part=field")
     with pytest.raises(ConfigError, match="snapshots"):
         train(begun, tmp_path, "snapshots=[0.5,1.5]")
+    wrong = {
+        "average=0.2": r"average=0.2 is none of the lengths=\[0.05, 0.1\]",
+        "precision=16-mixed": "precision=16-mixed",
+        "optimizer.decay=linear": "optimizer.decay",
+        "data.source_target_noise=0.3": "data.source_target_noise",
+        "data.train_source_view=3": "data.train_source_view",
+        "conditioning=concat": "another CDM than conditioning=concat needs: set fresh_cdm=true",
+    }
+    for setting, words in wrong.items():
+        with pytest.raises(ConfigError, match=words):
+            train(begun, tmp_path, setting)
     reader, _ = scenes_of(begun[0])
     whole = reader.load
     monkeypatch.setattr(reader, "load", lambda index: whole(index, range(5 - (index == 1))))

@@ -1,16 +1,16 @@
 """Training with all images on the device and one CUDA graph per step.
 
 A small model's step on a GPU takes as long as the host needs to start its kernels. Here nothing is asked of the host:
-draws, noise and times are made on the device, so a step is one graph that is replayed. On a CPU the same steps run one
-by one. The loss is `NerfDiffModule`'s; what is left out is what a run of minutes can do without: resuming,
-validation, previews (evaluate.py does these afterwards, on the snapshots too).
+images and draws lie on the device, noise and times are made there, so a step is one graph that is replayed. On a CPU
+the same steps run one by one. The loss is `NerfDiffModule`'s; what is left out is what a run of minutes can do without:
+resuming, validation, previews (evaluate.py does these afterwards, on the snapshots too).
 """
 
 import gc
 import logging
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,12 +20,11 @@ import torch.nn.functional as F
 from hydra.utils import instantiate
 from jaxtyping import Float, Int64, UInt8
 from omegaconf import DictConfig
-from safetensors.torch import save_file
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 from torch.utils.tensorboard import SummaryWriter
 
-from nerfdiff.averages import exponent_of
+from nerfdiff.averages import PowerAverages
 from nerfdiff.cameras import Cameras
 from nerfdiff.checkpoint import LoadedModel, export_model, load_model
 from nerfdiff.data.cache import CachedReader
@@ -37,7 +36,6 @@ from nerfdiff.model import NerfDiff
 from nerfdiff.results.environment import git_state
 from nerfdiff.training.run import plain
 from nerfdiff.utils.errors import ConfigError, DataError, TrainingDiverged
-from nerfdiff.utils.files import atomic
 from nerfdiff.utils.images import to_signed
 from nerfdiff.utils.randomness import seed_of, spread_times
 
@@ -62,7 +60,7 @@ class ResidentScenes:
 
     @staticmethod
     def read(reader: SceneReader, wanted: int | None, device: torch.device) -> "ResidentScenes":
-        """Scenes spread evenly over a reader.
+        """Read scenes spread evenly over a reader.
 
         Raises:
             DataError: they have different numbers of views.
@@ -76,13 +74,13 @@ class ResidentScenes:
         return ResidentScenes(pixels, cameras.c2w, cameras.K, *bounds)
 
     def images(self, scene: Int64[Tensor, "*n"], view: Int64[Tensor, "*n"]) -> Float[Tensor, "*n 3 height width"]:
-        """Colours in [0, 1]."""
+        """Return colours in [0, 1]."""
         return self.pixels[scene, view].float() / 255
 
     def cameras(
         self, scene: Int64[Tensor, "n"], source: Int64[Tensor, "n"], targets: Int64[Tensor, "n t"]
     ) -> tuple[Cameras, Cameras]:
-        """The sources' cameras [n], and the targets' [n, t] in their space."""
+        """Return the sources' cameras [n], and the targets' [n, t] in their space."""
         size = self.pixels.shape[-2:]
         sources = Cameras(self.c2w[scene, source], self.K[scene, source], *size)
         rows = scene[:, None].expand_as(targets)
@@ -95,7 +93,7 @@ class ResidentScenes:
 def draw_table(
     seed: int, draws: int, scenes: int, views: int, targets: int, sources: int, source_as_target: float
 ) -> Int64[Tensor, "draws columns"]:
-    """Scene, source view and target views of each draw, by the rule of `nerfdiff.data.draws.Draws`.
+    """Draw a scene, a source view and target views for each row, by the rule of `nerfdiff.data.draws.Draws`.
 
     Raises:
         ConfigError: a scene has too few views.
@@ -180,6 +178,7 @@ class Step:
             capturable=cuda,
         )
         self.losses = {name: torch.zeros((), device=device) for name in ("loss_dm", "loss_ic")}
+        self.taken = 0
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def capture(self, warm_up: int = 3) -> None:
@@ -201,7 +200,7 @@ class Step:
                     self._step()
                 self.optimizer.zero_grad(set_to_none=True)
                 with torch.cuda.graph(graph, stream=aside, capture_error_mode="thread_local"):
-                    self._step(clear=False)
+                    self._step(recorded=True)
         except RuntimeError:
             torch.cuda.synchronize()
             # the generator still takes itself for recorded, and would refuse to draw
@@ -214,6 +213,7 @@ class Step:
         self._graph = graph
 
     def run(self, lr: float) -> None:
+        """Make one step with this learning rate."""
         if self.lr.is_cuda:
             self.lr.fill_(lr)
         else:
@@ -222,21 +222,23 @@ class Step:
             self._step()
         else:
             self._graph.replay()
+            self.taken += 1
 
-    def _step(self, clear: bool = True) -> None:
-        if clear:
+    def _step(self, recorded: bool = False) -> None:
+        if not recorded:
             self.optimizer.zero_grad(set_to_none=True)
+            self.taken += 1
         with self.autocast:
-            losses = self._losses(self.table[self.number][0])
+            losses = self._losses(self.table[self.number % len(self.table)][0])
         sum(losses.values()).backward()
         clip_grad_norm_(self.trained, self.clip, foreach=True)
         self.optimizer.step()
         for name, value in losses.items():
             self.losses[name].copy_(value.detach())
-        self.number.add_(1).remainder_(len(self.table))
+        self.number.add_(1)
 
     def _losses(self, rows: Int64[Tensor, "batch columns"]) -> dict[str, Tensor]:
-        """L^DM, and L^IC where the field is trained (paper, "Training phase")."""
+        """Compute L^DM, and L^IC where the field is trained (paper, "Training phase")."""
         scene, source, targets = rows[:, 0], rows[:, 1], rows[:, 2:]
         scenes, model = self.scenes, self.model
         truth = scenes.images(scene[:, None].expand_as(targets), targets)
@@ -266,33 +268,6 @@ class Step:
         return losses | {"loss_dm": F.mse_loss(predicted, v_from_x0_eps(x0, eps, alpha, sigma))}
 
 
-class Averages:
-    """Power-function averages of a model's weights (`nerfdiff.averages`), and their files."""
-
-    def __init__(self, model: NerfDiff, lengths: list[float]):
-        self.model = model
-        self.exponents = {length: exponent_of(length) for length in lengths}
-        self.current = [p.detach() for p in model.parameters()]
-        self.values = {length: [p.clone() for p in self.current] for length in lengths}
-
-    @torch.no_grad()
-    def update(self, step: int) -> None:
-        for length, exponent in self.exponents.items():
-            torch._foreach_lerp_(self.values[length], self.current, 1 - (1 - 1 / step) ** (exponent + 1))
-
-    def save(self, folder: Path, step: int) -> None:
-        for length, values in self.values.items():
-            names = [name for name, _ in self.model.named_parameters()]
-            state = {n: v.to("cpu", torch.float16).contiguous() for n, v in zip(names, values, strict=True)}
-            with atomic(folder / f"step_{step:07d}_{length}.safetensors") as temporary:
-                save_file(state, temporary, {"step": str(step), "length": str(length)})
-
-    @torch.no_grad()
-    def load_into(self, model: NerfDiff, length: float) -> None:
-        for parameter, value in zip(model.parameters(), self.values[length], strict=True):
-            parameter.copy_(value)
-
-
 def train_resident(cfg: DictConfig) -> Path:
     """Train for `cfg.minutes` or `cfg.steps`, whichever ends first, from `cfg.init`.
 
@@ -302,6 +277,7 @@ def train_resident(cfg: DictConfig) -> Path:
     Raises:
         UserError: data, config or checkpoint that do not fit, or weights that are no longer finite.
     """
+    _check(cfg)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     begun = load_model(cfg.init, "ema", cfg.paths.assets_dir)
     model = _model(cfg, begun).to(device).train()
@@ -333,12 +309,14 @@ def train_resident(cfg: DictConfig) -> Path:
     step = Step(
         model, scenes, table, data.batch_size, frozen, plain(cfg.optimizer), cfg.gradient_clip_val, cfg.seed, autocast
     )
-    averages = Averages(model, list(cfg.lengths))
-    taken = _train(cfg, step, averages)
-    averages.load_into(model, cfg.average)
+    averages = PowerAverages(list(cfg.lengths))
+    _train(cfg, step, averages)
+    with torch.no_grad():
+        for parameter, value in zip(model.parameters(), averages.values[str(cfg.average)], strict=True):
+            parameter.copy_(value)
     seen = {
         "part": "CDM" if cfg.part == "cdm" else "field and the CDM",
-        "images": taken * data.batch_size * data.target_views,
+        "images": step.taken * data.batch_size * data.target_views,
         "dataset": data.name,
         "scenes": count,
         "about": data.about,
@@ -356,77 +334,89 @@ def train_resident(cfg: DictConfig) -> Path:
     return export_model(loaded, Path(cfg.paths.output_dir) / "model", torch.float32)
 
 
-def _model(cfg: DictConfig, begun: LoadedModel) -> NerfDiff:
-    """A model of the sizes of `init`, with its field, and with its CDM unless that is to begin afresh."""
+def _check(cfg: DictConfig) -> None:
+    """Raise ConfigError for settings that are found wrong only after training, or that training from memory lacks."""
     if cfg.part not in ("cdm", "joint"):
         raise ConfigError(f"part={cfg.part}: choose cdm (the field stays as it is) or joint")
+    if cfg.precision not in ("bf16-mixed", "32-true"):
+        raise ConfigError(f"precision={cfg.precision}: choose bf16-mixed or 32-true")
+    if cfg.optimizer.decay not in ("none", "cosine"):
+        raise ConfigError(f"optimizer.decay must be none or cosine, got {cfg.optimizer.decay!r}")
+    if cfg.average not in cfg.lengths:
+        raise ConfigError(f"average={cfg.average} is none of the lengths={list(cfg.lengths)} that are kept")
+    if not cfg.snapshots or not all(0 < share <= 1 for share in cfg.snapshots):
+        raise ConfigError(f"snapshots={list(cfg.snapshots)}: expected shares of the training, above 0, at most 1")
+    for key in ("train_source_view", "source_target_noise"):
+        if cfg.data[key]:
+            raise ConfigError(f"data.{key}={cfg.data[key]}: training from memory does not know it; use train.py")
+
+
+def _model(cfg: DictConfig, begun: LoadedModel) -> NerfDiff:
+    """Build a model of the sizes of `init`, with its field, and with its CDM unless that is to begin afresh."""
     torch.manual_seed(cfg.seed)
     sizes = dict(begun.config)
     render = {**sizes["render"], "backend": cfg.backend}
     model = NerfDiff(**sizes | {"render": render, "conditioning": plain(cfg.conditioning)})
-    kept = begun.model.state_dict()
+    begins = begun.model.state_dict()
     if cfg.fresh_cdm:
-        kept = {name: value for name, value in kept.items() if not name.startswith("denoiser.")}
-    missing = model.load_state_dict(kept, strict=False).missing_keys
-    if any(not name.startswith("denoiser.") for name in missing) or (missing and not cfg.fresh_cdm):
-        raise ConfigError(f"init={cfg.init} lacks {missing[0]}; set fresh_cdm=true to begin with a new CDM")
+        begins = {n: v for n, v in begins.items() if not n.startswith("denoiser.")}
+        begins |= {n: v for n, v in model.state_dict().items() if n.startswith("denoiser.")}
+    try:
+        model.load_state_dict(begins)
+    except RuntimeError as error:  # of other names or sizes
+        raise ConfigError(
+            f"init={cfg.init} has another CDM than conditioning={cfg.conditioning.name} needs: set fresh_cdm=true to "
+            "begin with a new one"
+        ) from error
     if cfg.channels_last:
         model.to(memory_format=torch.channels_last)
     return model
 
 
-def _train(cfg: DictConfig, step: Step, averages: Averages) -> int:
-    """Returns the number of steps."""
+def _train(cfg: DictConfig, step: Step, averages: PowerAverages) -> None:
+    """Make steps until the time or their number is over, and save averages on the way."""
     options, output = plain(cfg.optimizer), Path(cfg.paths.output_dir)
-    records = _records(step)
-    marks = _marks(sorted(cfg.snapshots), cfg)
-    taken, mark = 0, next(marks)
+    names, parameters = zip(*step.model.named_parameters(), strict=True)
+    marks = sorted(cfg.snapshots)
     began = said = time.monotonic()
     with SummaryWriter(output / "tensorboard") as curves:
         while True:
-            done = max(taken / cfg.steps, (time.monotonic() - began) / (60 * cfg.minutes))
-            if done >= mark:
-                averages.save(output / "snapshots", taken)
-                mark = next(marks, math.inf)
-            if done >= 1:
+            done = max(step.taken / cfg.steps, (time.monotonic() - began) / (60 * cfg.minutes))
+            if marks and done >= marks[0] and step.taken:
+                averages.save(output / "snapshots", names, step.taken)
+                marks = [mark for mark in marks if mark > done]
+            if done >= 1 and step.taken:
                 break
-            fall = 0.5 * (1 + math.cos(math.pi * done)) if options["decay"] == "cosine" else 1.0
-            step.run(options["lr"] * fall * min(1.0, (taken + 1) / max(1, options["warmup_steps"])))
-            taken += 1
-            averages.update(taken)
-            if records and taken == cfg.eager_steps:
+            fall = 0.5 * (1 + math.cos(math.pi * min(1.0, done))) if options["decay"] == "cosine" else 1.0
+            step.run(options["lr"] * fall * min(1.0, (step.taken + 1) / max(1, options["warmup_steps"])))
+            averages.update(parameters, step.taken)
+            if _records(step) and step.taken == cfg.eager_steps:
                 try:
                     step.capture()
                 except RuntimeError as error:
                     log.warning("the step is not recorded, and made kernel by kernel: %s", _causes(error))
-            if taken % cfg.log_every_n_steps == 0:  # reading the losses waits for the device, so steps do not pile up
+            if step.taken % cfg.log_every_n_steps == 0:  # reading the losses waits for the device: steps do not pile up
                 losses = {name: value.item() for name, value in step.losses.items()}
                 if not all(map(math.isfinite, losses.values())):
-                    raise TrainingDiverged(f"step {taken}: the loss is not finite; lower optimizer.lr")
+                    raise TrainingDiverged(f"step {step.taken}: the loss is not finite; lower optimizer.lr")
                 for name, value in losses.items():
-                    curves.add_scalar(f"train/{name}", value, taken)
-                if (now := time.monotonic()) - said > cfg.every_seconds or taken == cfg.log_every_n_steps:
+                    curves.add_scalar(f"train/{name}", value, step.taken)
+                if (now := time.monotonic()) - said > cfg.every_seconds or step.taken == cfg.log_every_n_steps:
                     words = ", ".join(f"{name} {value:.4f}" for name, value in losses.items())
-                    log.info("step %d, %s, %.1f steps/s, %.0f %% done", taken, words, taken / (now - began), 100 * done)
+                    rate = step.taken / (now - began)
+                    log.info("step %d, %s, %.1f steps/s, %.0f %% done", step.taken, words, rate, 100 * done)
                     said = now
-    return taken
 
 
 def _records(step: Step) -> bool:
-    """Whether there are CUDA graphs here."""
+    """Return true where CUDA graphs are."""
     return step.number.is_cuda
 
 
 def _causes(error: BaseException | None) -> str:
-    """What led to an error, first things first: the end of a broken recording hides what broke it."""
+    """Name the errors that led to this one, first things first: the end of a broken recording hides what broke it."""
     lines: list[str] = []
     while error is not None:
         lines.append((str(error).splitlines() or [type(error).__name__])[0])
         error = error.__cause__ or error.__context__
     return "; then ".join(reversed(lines))
-
-
-def _marks(shares: list[float], cfg: DictConfig) -> Iterator[float]:
-    if not shares or shares[-1] > 1 or shares[0] <= 0:
-        raise ConfigError(f"snapshots={list(cfg.snapshots)}: expected shares of the training, above 0, at most 1")
-    yield from shares

@@ -1,4 +1,4 @@
-"""What pyproject.toml cannot say: in a wheel conf/ and assets/ lie within the package."""
+"""Build step that pyproject.toml cannot express: put conf/ and assets/ into the package of a wheel."""
 
 from pathlib import Path
 from shutil import copytree, rmtree

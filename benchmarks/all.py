@@ -31,9 +31,9 @@ SWEEPS = {
 }
 COMPILED = ("unet", "training_step", "ngd_object")
 MEASURING = 0.75
-"""Of a benchmark's time: the rest is for what runs when that is over."""
+"""Share of a benchmark's time that it measures: the rest is for what runs when that is over."""
 CPU_RAYS = 512
-"""Of a view, where a CPU renders it by pixel-aligned NeRFs."""
+"""Rays timed of a view, where a CPU renders it by pixel-aligned NeRFs."""
 
 
 def main(words: list[str] | None = None) -> int:

@@ -18,7 +18,7 @@ NUMBER = 4
 
 
 def rendering(renderer: Renderer, config: dict[str, Any], plane: int, rays: int, scenes: int, backward: bool) -> Work:
-    """Of rendering `rays` rays in each of `scenes` scenes.
+    """Count the cost of rendering `rays` rays in each of `scenes` scenes.
 
     Operations: at every sample three bilinear gathers (4 taps, a multiplication and an addition each), and the two
     layers; the backward pass costs twice as much (recomputing is not counted). Bytes: the least that must move if
@@ -39,19 +39,19 @@ def rendering(renderer: Renderer, config: dict[str, Any], plane: int, rays: int,
 
 
 def encoding(config: dict[str, Any], size: int, dtype: torch.dtype) -> Work:
-    """Of encoding one image; see `counted`."""
+    """Count the cost of encoding one image; see `counted`."""
     model = build_on_meta(config)
     return counted(lambda: _encoded(model, size, 1), dtype)
 
 
 def denoising(config: dict[str, Any], size: int, views: int, dtype: torch.dtype) -> Work:
-    """Of one evaluation of the CDM for `views` views of one scene, the encoder's features being there."""
+    """Count the cost of one evaluation of the CDM for `views` views of one scene, given its features."""
     model = build_on_meta(config)
     return counted(_denoise(model, size, 1, views), dtype)
 
 
 def training(config: dict[str, Any], size: int, batch: int, targets: int, dtype: torch.dtype) -> Work:
-    """Of a training step: the backward pass of a layer takes twice its forward pass; recomputing is not counted."""
+    """Count the cost of a training step: a layer's backward pass is two forward ones; recomputing is left out."""
     model = build_on_meta(config)
     parts = [
         counted(lambda: _encoded(model, size, batch), dtype),
@@ -62,7 +62,7 @@ def training(config: dict[str, Any], size: int, batch: int, targets: int, dtype:
 
 
 def counted(call: Callable[[], Any], dtype: torch.dtype) -> Work:
-    """Of a computation on the meta device, which takes no time: products and convolutions as PyTorch counts them, and
+    """Count the cost of a call on the meta device: products and convolutions as PyTorch counts them, and
     the bytes of all inputs and outputs of its operators, as if each went through memory once.
 
     Args:

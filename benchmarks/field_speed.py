@@ -105,7 +105,7 @@ def _rendering(subjects: dict[str, Subject], count: int | None, seconds: float) 
 
 
 def rendering_work(measured: Subject, rays: int) -> Work:
-    """Of one scene's rays, forwards: as `costs.rendering`, the gathers and layers being the field's own.
+    """Count the work of rendering one scene's rays: as `costs.rendering`, the gathers and layers being the field's own.
 
     A pixel-aligned field's point takes one bilinear gather (4 taps, a multiplication and an addition each) of all
     channels, and every weight of the MLP once, but for those of layers that work on whole maps before.
@@ -137,7 +137,7 @@ def _encode(measured: Subject) -> Encoding:
 
 
 def _rays(measured: Subject, count: int | None) -> Rays:
-    """Of another view, as many as are asked for, here and there."""
+    """Return rays of another view, all or so many spread over it."""
     views = _views(measured)
     rays = views.target_cameras.rays(views.near[:, None], views.far[:, None])
     chosen = torch.randperm(measured.size**2, generator=torch.Generator().manual_seed(0))[:count]
@@ -157,7 +157,7 @@ def _without_gradients(measured: Subject, call: Callable[[], Any]) -> Callable[[
 
 
 def _slower(row: Row) -> dict[str, float]:
-    """How many times the reference's seconds it takes."""
+    """Divide a field's seconds by the reference's."""
     return {} if row.ratio is None else {"s / ref.": 1 / row.ratio}
 
 

@@ -1,4 +1,4 @@
-"""How benchmarks measure: interleaved timings, and the device's own limits.
+"""Measuring for benchmarks: interleaved timings, and the device's own limits.
 
 Variants of one piece of work are timed in turn, round after round, so that whatever slows the machine slows them all;
 the first variant is the reference, and ratios are medians over rounds. The device's copy bandwidth and matrix rate are
@@ -24,11 +24,11 @@ from nerfdiff.cli import choices
 from nerfdiff.utils.timing import Stopwatch, summarise
 
 RESULTS = Path(os.environ.get("OUT") or Path(__file__).parent / "results")
-"""Where files go that no --out sends elsewhere: into $OUT, where it is set."""
+"""Folder of the files without --out: $OUT where it is set."""
 SHORTEST = 5e-3
 """Seconds: quicker calls are timed several at once, so that starting and waiting for the device do not count."""
 NO_TIME = "no time left"
-"""Why a variant was not measured after the deadline."""
+"""Reason given for a variant that was not measured before the deadline."""
 
 
 class Deadline:
@@ -38,7 +38,7 @@ class Deadline:
         self.end = math.inf
 
     def set(self, end: str) -> float:
-        """Of Unix time, so that what a process takes to start counts."""
+        """Set the end in Unix time, so that a process's start counts."""
         self.end = float(end)
         return self.end
 
@@ -48,12 +48,12 @@ class Deadline:
 
 
 DEADLINE = Deadline()
-"""Of this process, set by --until."""
+"""Deadline of this process, set by --until."""
 
 
 @dataclass(frozen=True)
 class Work:
-    """What has to be done, however it is done.
+    """Work that has to be done, however it is done.
 
     Args:
         flops: floating-point operations, a multiplication and an addition being two.
@@ -66,7 +66,7 @@ class Work:
 
 @dataclass(frozen=True)
 class Unavailable:
-    """Why a variant cannot run here."""
+    """A variant that cannot run here, and the reason."""
 
     reason: str
 
@@ -103,7 +103,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Limits:
-    """What the device does at best, measured.
+    """The device's best rates, measured.
 
     Args:
         copy: bytes per second of a large copy, read and written.
@@ -137,7 +137,7 @@ def parser(description: str, model: str = "tiny", sweeps: Sequence[str] = ()) ->
 def settings_of(
     arguments: argparse.Namespace, usual: Mapping[str, int], sweeps: Mapping[str, Sequence[int]]
 ) -> list[dict[str, int]]:
-    """What is measured: the usual setting, or a scaling curve's, in which one value differs."""
+    """Return the settings to measure: the usual one, or a scaling curve's, in which one value differs."""
     if arguments.sweep is None:
         return [dict(usual)]
     return [dict(usual) | {arguments.sweep: value} for value in arguments.values or sweeps[arguments.sweep]]

@@ -1,4 +1,4 @@
-"""What the renderer's kernels cost, counted from their machine code: no GPU is needed.
+"""Costs of the renderer's kernels, counted from their machine code: no GPU is needed.
 
     python benchmarks/instructions.py
     python benchmarks/instructions.py --capability 80 90 100 --exact
@@ -46,7 +46,7 @@ HALF |= {
     "RAYS": False,
 }
 EXACT = {"HALF": False, "OPAQUE": True, "EVEN": True, "JITTER": False, "TABLE": "ordered", "RAYS": True, "STOP": False}
-"""What else can be asked for, all at once."""
+"""Compile-time options with all other features on."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Code:
 
     @property
     def warps_per_multiprocessor(self) -> int:
-        """Of 64 at most, in 32 programs: 65536 registers and 227 KiB of shared memory are shared."""
+        """Return warps that fit a multiprocessor: up to 64 in 32 programs, with 65536 registers and 227 KiB for all."""
         of_warp = -(-self.resources[0] * 32 // 256) * 256
         programs = min(65536 // (of_warp * self.warps), 32, 64 // self.warps)
         return self.warps * min(programs, 227 * 1024 // (self.shared + 1024))
@@ -124,7 +124,7 @@ class Code:
 
 
 def _target(words: str) -> int | None:
-    """Where an instruction jumps to, if not for lanes that came apart."""
+    """Return the address an instruction jumps to; None for jumps of diverged lanes."""
     found = re.search(r"\bBRA\b(?!\.DIV).*?(0x[0-9a-f]+)", words)
     return int(found[1], 16) if found else None
 

@@ -45,7 +45,7 @@ CHANGED = ("render K views", FIT)
 
 @dataclass(frozen=True)
 class Plan:
-    """What is done for an object.
+    """The settings an object is made with.
 
     Args:
         strategy, budget: as configured.
@@ -81,11 +81,11 @@ class Plan:
 
     @property
     def keeps_coarse(self) -> bool:
-        """Whether inner steps draw from weights that rendering for the teacher found."""
+        """Return true if inner steps draw from weights that rendering for the teacher found."""
         return self.strategy["coarse"] == "refresh" and self.method(1).teacher.func.follows_field
 
     def warning(self, extrapolate: bool) -> str | None:
-        """Where not all steps are timed."""
+        """Say which steps are not timed; None where all are."""
         every = self.budget["steps"]
         if self.timed == every:
             return None
@@ -96,7 +96,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Way:
-    """How objects are made."""
+    """A way to make objects."""
 
     model: NerfDiff
     cuda_graphs: bool
@@ -223,7 +223,7 @@ def _parts(
     setting: dict[str, int],
     seconds: float,
 ) -> Iterator[list[Row]]:
-    """What an object consists of, each by itself: of one scene, but for what scenes do together."""
+    """Time an object's parts one by one: of one scene, but for those that scenes share."""
     dtype, config, size = measured.dtype, measured.config, measured.size
     views_rendered = costs.rendering(measured.model.renderer, config, size, setting["views"] * size**2, 1, False)
     works = {
@@ -249,7 +249,7 @@ def _parts(
 
 
 def _fitting(measured: Subject, budget: dict[str, int], scenes: int) -> Work:
-    """Of N inner steps."""
+    """Count the work of N inner steps."""
     renderer, size = measured.model.renderer, measured.size
     one = costs.rendering(renderer, measured.config, size, budget["rays"], scenes, backward=True)
     return Work(one.flops * budget["inner_steps"], one.bytes * budget["inner_steps"])
@@ -292,8 +292,8 @@ def _pieces(measured: Subject, way: Way, one: ViewBatch, setting: dict[str, int]
 
 
 def _work(measured: Subject, budget: dict[str, int], setting: dict[str, int], steps: int) -> Work | None:
-    """Of NGD on all scenes: encoding, conditions, and at every step denoising, rendering and N inner steps. None where
-    not all of the CDM is computed."""
+    """Count the work of NGD on all scenes: encoding, conditions, and at every step denoising, rendering and N
+    inner steps. None where not all of the CDM is computed."""
     if budget["deep_every"] > 1:
         return None
     config, size, renderer = measured.config, measured.size, measured.model.renderer

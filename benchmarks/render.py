@@ -23,9 +23,9 @@ from subjects import Subject, scene, subject
 from variants import renderers
 
 VIEW, FORWARD, BACKWARD, STEP = WAYS = "one view", "forward", "forward and backward", "inner step"
-"""What is timed: the first and the last take other rays than `rays` says."""
+"""The timed calls; the first and the last do not use `rays`."""
 INNER, STEPS = {"rays": 4096, "views": 50}, 16
-"""Of an inner step, B and K; and how many are timed at once on a GPU, where they are replayed from a CUDA graph."""
+"""B and K of an inner step; inner steps per timed call on a GPU, where they are replayed from a CUDA graph."""
 SWEEPS = {
     "rays": (256, 1024, 4096, 16384, 65536),
     "samples": (16, 32, 64, 128, 256),
@@ -91,7 +91,7 @@ def noise_field(measured: Subject, plane: int, scenes: int) -> RefinedField:
 
 
 def random_rays(measured: Subject, field: RefinedField, count: int) -> Rays:
-    """Of the cameras around each scene."""
+    """Draw rays of the cameras around each scene."""
     cameras = scene(measured, 8, len(field.planes)).target_cameras
     batches = RayBatches(cameras, field.near, field.far)
     scenes, per_scene = batches.shape
@@ -117,7 +117,7 @@ def _step(measured: Subject, renderer: Renderer, setting: dict[str, int], way: s
 
 
 def steps_at_once(measured: Subject) -> int:
-    """Of the inner steps that one call takes."""
+    """Return the inner steps per timed call."""
     return STEPS if measured.device.type == "cuda" else 1
 
 

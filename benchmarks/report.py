@@ -1,4 +1,4 @@
-"""What a benchmark leaves: a table on the terminal, a file that names model, hardware and date, a sweep's picture.
+"""Reports of benchmarks: a table on the terminal, a file that names model, hardware and date, a sweep's picture.
 
 `python benchmarks/report.py FOLDER…` prints what is in such files."""
 
@@ -167,7 +167,7 @@ def duration(seconds: float) -> str:
 
 
 def number(value: Any) -> str:
-    """As short as it can be read."""
+    """Format a number as shortly as it can be read."""
     if isinstance(value, float):
         return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
     return str(value)

@@ -1,4 +1,4 @@
-"""How long it takes to read many rows of results, and to chart them, on one core.
+"""Time to read many rows of results, and to chart them, on one core.
 
 python benchmarks/rows.py 10000 100000 [--chart]
 """

@@ -1,4 +1,4 @@
-"""What is measured: a model of any size, and scenes made of noise, on a device."""
+"""Subjects of benchmarks: a model of any size, and scenes made of noise, on a device."""
 
 import argparse
 from contextlib import AbstractContextManager, nullcontext
@@ -45,7 +45,7 @@ class Subject:
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of matrix products."""
+        """Type of matrix products."""
         return torch.bfloat16 if self.precision == "bf16-mixed" else torch.float32
 
     def autocast(self) -> AbstractContextManager:
@@ -55,7 +55,7 @@ class Subject:
         return torch.autocast(self.device.type, torch.bfloat16, cache_enabled=False)
 
     def limits(self, seconds: float) -> Limits:
-        """Of the device, in this precision."""
+        """Measure the device's limits in this precision."""
         return limits(self.device, self.dtype, min(seconds, 2.0))
 
 

@@ -142,7 +142,7 @@ def _peak(measured: Subject, step: Callable[[], None]) -> int:
 
 
 def largest_batches(measured: Subject, cfg, gib: float) -> dict[str, int]:
-    """How many draws fit, by how it was found out."""
+    """Find the largest batch that fits: computed, and on a GPU tried."""
     memory, views, size = int(gib * 2**30), cfg.data.target_views, measured.size
     computed = largest_batch(measured.config, memory, views, size, size, measured.precision)
     found = {f"largest batch in {gib:g} GiB, computed in {measured.precision}": computed}
@@ -165,7 +165,7 @@ def largest(fits: Callable[[int], bool]) -> int:
 
 
 def _fits(measured: Subject, cfg, batch: int) -> bool:
-    """Whether two steps run beside an average of the weights: Adam's moments come with the first."""
+    """Return true if two steps run beside an average of the weights: Adam's moments come with the first."""
     renderer = replace(measured.model.renderer, backend="auto")
     kind = "channels_last" if channels_last(None, measured.device, False) else "eager"  # a run's own choice
     try:

@@ -32,7 +32,7 @@ def renderers(model: NerfDiff, renderer: Renderer) -> dict[str, Renderer | Unava
 
 
 def kinds(compiled: bool) -> tuple[str, ...]:
-    """How U-Nets may run; eager in PyTorch's own memory layout is the reference.
+    """Return the ways U-Nets may run; eager in PyTorch's own memory layout is the reference.
 
     Args:
         compiled: whether to compile them too, which takes up to minutes at the first call.
@@ -55,7 +55,7 @@ def models(model: NerfDiff, compiled: bool) -> dict[str, NerfDiff]:
 
 
 def _obstacle(model: NerfDiff, kernels: Renderer) -> str | None:
-    """Why the fused renderer would hand these over to the reference."""
+    """Return why the fused renderer cannot render these; None where it can."""
     device = next(model.parameters()).device
     if device.type != "cuda":
         return "needs a CUDA GPU"

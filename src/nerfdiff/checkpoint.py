@@ -140,7 +140,7 @@ def _check_bytes(path: Path, changed: int, size: int) -> None:
 
 
 def _unexpected(checkpoint: Any) -> str | None:
-    """What is not as `NerfDiffModule` saves it, if anything."""
+    """Name the first part that is not as `NerfDiffModule` saves it; None where all are."""
 
     def tensors(value: Any) -> bool:
         return isinstance(value, Mapping) and all(isinstance(part, torch.Tensor) for part in value.values())
@@ -166,7 +166,7 @@ def _unexpected(checkpoint: Any) -> str | None:
 
 
 def _are_phases(value: Any) -> bool:
-    """Whether this is a list of what `NerfDiffModule.trained_on` says of each training."""
+    """Return true for a list of `NerfDiffModule.trained_on`'s entries."""
     kinds = {"part": str, "images": int, "scenes": int, "dataset": str, "about": str}
     return isinstance(value, list) and all(
         isinstance(phase, Mapping) and all(isinstance(phase.get(key), kind) for key, kind in kinds.items())
@@ -184,7 +184,7 @@ def _is_text_by_name(value: Any) -> bool:
 
 
 def _instead(path: Path) -> str:
-    """What to do where a checkpoint cannot be read: the one beside it that was trained longest can perhaps."""
+    """Say what to do where a checkpoint cannot be read: use the one beside it that was trained longest."""
     steps = {}
     for other in path.parent.glob("*.ckpt") if path.parent.is_dir() else ():
         if other.name not in (path.name, DIVERGED, DAMAGED) and other.is_file():

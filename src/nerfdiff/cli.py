@@ -1,4 +1,4 @@
-"""What the entry points share: overrides checked before anything runs, and errors a person can read."""
+"""Common parts of the entry points: overrides checked before anything runs, and errors a person can read."""
 
 import difflib
 import functools
@@ -162,7 +162,7 @@ def explain(error: BaseException, cfg: DictConfig | None = None) -> str | None:
 
 
 def _refused(error: BaseException, cfg: DictConfig | None) -> str | None:
-    """What the system would not give: a file, or memory."""
+    """Name what the system would not give: a file, or memory."""
     if is_out_of_memory(error):
         known = ("data.batch_size", "budget.rays", "budget.views", "strategy.views_at_once", "scenes_at_once", "chunk")
         keys = [key for key in known if cfg is not None and OmegaConf.select(cfg, key, default=None) is not None]
@@ -177,7 +177,7 @@ def _refused(error: BaseException, cfg: DictConfig | None) -> str | None:
 
 
 def _last_line(error: BaseException) -> str:
-    """Of what it says: where a DataLoader's worker raised it, the lines before are a traceback."""
+    """Return the last line of an error: where a DataLoader's worker raised it, the lines before are a traceback."""
     return (str(error).strip().splitlines() or [""])[-1]
 
 

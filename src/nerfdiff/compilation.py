@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 CHOICES = ("none", "unets")
 CACHE_VARIABLE = "TORCHINDUCTOR_CACHE_DIR"
 VERSIONS = 32
-"""Of both U-Nets together, by sizes, gradients, precision and reuse of deep levels; more run as they are."""
+"""Most compiled variants of both U-Nets together (sizes, gradients, precision, deep levels); more run uncompiled."""
 
 
 def compile_unets(model: NerfDiff, choice: str, cache: str | Path, backend: str = "inductor") -> None:
@@ -54,5 +54,5 @@ def compile_unets(model: NerfDiff, choice: str, cache: str | Path, backend: str 
 
 
 def _unets(model: NerfDiff) -> list[nn.Module]:
-    """Both; of a pixel-aligned NeRF, whose encoder is another, the CDM's."""
+    """Return both U-Nets; a pixel-aligned NeRF has only the CDM's."""
     return [module for module in model.modules() if isinstance(module, UNet)]

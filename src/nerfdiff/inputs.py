@@ -20,7 +20,7 @@ LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
 
 
 def checkpoints(run: str | Path) -> list[Path]:
-    """Where a run keeps the checkpoint it resumes from, and the one before it."""
+    """List a run's checkpoint to resume from, and the one before it."""
     return [Path(run) / "checkpoints" / name for name in (LAST, PREVIOUS)]
 
 
@@ -102,7 +102,7 @@ def check_output(cfg: DictConfig) -> None:
 
 
 def _value(cfg: DictConfig, key: str) -> Any:
-    """Of a key; None where it cannot be told before the job runs."""
+    """Return a key's value; None where it cannot be told before the job runs."""
     try:
         return OmegaConf.select(cfg, key, throw_on_missing=True)
     except MissingMandatoryValue as error:

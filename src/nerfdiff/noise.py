@@ -1,4 +1,4 @@
-"""What libraries and repeated jobs say by themselves, brought down to what matters to a person."""
+"""Filters for messages of libraries and repeated jobs that do not matter to a person."""
 
 import logging
 import os

@@ -25,7 +25,7 @@ def watch() -> None:
 
 
 def is_launched() -> bool:
-    """Whether this process was launched to help another."""
+    """Return true if this process was launched to help another."""
     return int(os.environ.get("LOCAL_RANK", 0)) > 0
 
 
@@ -60,7 +60,7 @@ def _sentence() -> str:
 
 
 class _Observer(subprocess_script._ChildProcessObserver):
-    """Where processes talk by gloo their next words tell; NCCL would wait for ever."""
+    """Watch child processes: gloo reports a lost one by itself, NCCL would wait for ever."""
 
     def __init__(self, main_pid: int, child_processes: list[Popen], sleep_period: int = 5):
         super().__init__(main_pid, child_processes, sleep_period)

@@ -1,4 +1,4 @@
-"""What tells the front of a car from its back: lights, grille, bumpers, plates, spoiler."""
+"""Parts that tell a car's front from its back: lights, grille, bumpers, plates, spoiler."""
 
 import numpy as np
 

@@ -63,7 +63,7 @@ def _back(
     x: float,
     round_: bool,
 ) -> list[Part]:
-    """What fills the frame between the two rear posts."""
+    """Build the back between the two rear posts."""
 
     def y(z: float) -> float:
         return rear + seat.lean * (z - seat.height) / (seat.top - seat.height)

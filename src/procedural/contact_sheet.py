@@ -23,7 +23,7 @@ def contact_sheet(images: Sequence[Sequence[Path]], scenes: int, views: int) -> 
 
 
 def _margin(images: Sequence[UInt8[np.ndarray, "height width 3"]]) -> int:
-    """How many pixels along all four borders are white in every image, but for one."""
+    """Count the pixels along all four borders that are white in every image, but for one."""
     drawn = np.any([(image < 255).any(axis=-1) for image in images], axis=0)
     if not drawn.any():
         return 0

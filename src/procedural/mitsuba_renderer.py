@@ -14,7 +14,7 @@ from procedural.colour import linear_to_srgb8
 
 @dataclass(frozen=True)
 class Film:
-    """How images are taken.
+    """Settings of rendered images.
 
     Args:
         height, width: pixels.
@@ -35,13 +35,13 @@ class Film:
 
 @runtime_checkable
 class World(Protocol):
-    """What is rendered."""
+    """A scene to render."""
 
     def entries(self, mi: Any) -> dict[str, Any]:
         """Lights and shapes of a Mitsuba scene, by name."""
 
     def labels(self, points: Float[np.ndarray, "*image 3"]) -> Int[np.ndarray, "*image"]:
-        """What surface points belong to: 0 is background, objects count from 1."""
+        """Return the object at each surface point: 0 is background, objects count from 1."""
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ HOW = (
     "mean over seeds of the medians; their intervals span the median ± half the interquartile range of every seed. "
     "Faint points are dominated: another is at least as good and as cheap, and better in one. Rings: some runs failed."
 )
-"""What the page says of its numbers."""
+"""The page's words on its numbers."""
 
 
 @dataclass

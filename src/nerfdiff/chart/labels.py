@@ -1,4 +1,4 @@
-"""How configurations are called: by the settings in which they differ."""
+"""Names of configurations: by the settings in which they differ."""
 
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Sequence
@@ -119,7 +119,7 @@ def _told_twice(settings: Sequence[Settings], keys: Sequence[str]) -> list[str]:
 
 
 def _settled(settings: Sequence[Settings], key: str, by: Sequence[str]) -> bool:
-    """Whether some have the overrides `by`, and these agree in `key` where they agree in them."""
+    """Return true if some have the overrides `by`, and these agree in `key` where they agree in them."""
     known: dict[tuple, str | None] = {}
     given = [values for values in settings if all(name in values for name in by)]
     return bool(given) and all(

@@ -33,7 +33,7 @@ def write_page(path: Path, title: str, content: dict[str, Any]) -> None:
 
 
 def _libraries() -> dict[str, str]:
-    """What draws charts and tables; a page that has neither goes without these megabytes."""
+    """Read the JavaScript libraries of charts and tables; a page that has neither goes without these megabytes."""
     try:
         import itables
         from plotly.offline import get_plotlyjs

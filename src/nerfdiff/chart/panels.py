@@ -1,4 +1,4 @@
-"""What may share a frontier: one device, and one set of test images."""
+"""Panels of the chart, which share a frontier: one device, and one set of test images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

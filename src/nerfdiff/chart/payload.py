@@ -56,7 +56,7 @@ def measured(
     costs: Sequence[Mapping[str, Any]],
     unnamed: Sequence[str],
 ) -> Measured:
-    """What there is to show of `metrics` (`charted`) and `costs`; these and `unnamed` are those of conf/chart.yaml."""
+    """Collect the values to show of `metrics` (see `charted`) and `costs`; conf/chart.yaml has both, and `unnamed`."""
     scales = {metric["field"]: 1.0 for metric in metrics} | {cost["field"]: cost["scale"] for cost in costs}
     estimates = [_scaled(configuration.estimates, scales) for configuration in found]
     panels = panels_of(found)

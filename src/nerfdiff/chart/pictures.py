@@ -33,7 +33,7 @@ def links(run: Run, page: Path) -> dict[str, str]:
 
 
 def _orbit(run: Run) -> Path | None:
-    """Of the first scene, where the run has none of all."""
+    """Return the orbit of all scenes, else that of the first."""
     predictions = run.file("predictions", str(run.row.strategy))
     if (own := run.file("orbit.mp4")) is not None or predictions is None:
         return own

@@ -14,7 +14,7 @@ from nerfdiff.utils.errors import DataError
 
 @dataclass(frozen=True)
 class Sample:
-    """What a batch is made of: positions of a source and of target views in a scene.
+    """An item of a batch: positions of a source and of target views in a scene.
 
     `draw` is the sample's number within the run; in evaluation, the scene's within its split. `source_shift` moves
     the cameras of those targets that are the source itself, in scene units along the source camera's axes.

@@ -134,7 +134,7 @@ class SceneDataModule(LightningDataModule):
         return {"root": str(Path(self.root).resolve()), "reader": reader.identity, "files": reader.fingerprint()}
 
     def state_dict(self) -> dict[str, str]:
-        """What a run is trained on, for its checkpoints: the reader's identity, and its files' fingerprint."""
+        """Identify the training data for checkpoints: the reader's identity, and its files' fingerprint."""
         return self._trained_on
 
     def reader(self, stage: str) -> SceneReader:
@@ -147,7 +147,7 @@ class SceneDataModule(LightningDataModule):
 
     @property
     def trained_scenes(self) -> int:
-        """How many scenes a run draws from."""
+        """Number of scenes a run draws from."""
         return len(spread(len(self.train_reader), self.train_scenes))
 
     def setup(self, stage: str) -> None:

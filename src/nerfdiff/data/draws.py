@@ -1,4 +1,4 @@
-"""What is trained on when: draw n = 0, 1, 2, … of a run is a pure function of the seed and n.
+"""The order of training: draw n = 0, 1, 2, … of a run is a pure function of the seed and n.
 
 A run resumes by going on at the next draw, and neither workers nor ranks nor gradient accumulation change
 which draws make up an optimizer step.
@@ -68,7 +68,7 @@ class Draws:
         return source, tuple(targets)
 
     def shift(self, draw: int) -> tuple[float, float, float] | None:
-        """How far the camera of a target that is the source itself is moved; None without noise.
+        """Draw the shift of the camera of a target that is the source itself; None without noise.
 
         Seen from exactly where it was taken, an input view is explained by a plane in front of the camera (paper,
         appendix, "Training phase").

@@ -30,7 +30,7 @@ MAX_ID = 64
 
 @dataclass(frozen=True)
 class Picture:
-    """How a picture is cut out, framed and seen.
+    """A picture of an object, cut out, framed, and given a camera.
 
     The object is where the mask is white and the picture opaque; without a mask, where a picture with a transparent
     border is opaque; else what is left without the near-white pixels that connect to the border. Of that the largest
@@ -138,7 +138,7 @@ class Picture:
         return (pixels >= 255 * self.white).all(-1)
 
     def _masked(self, path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
-        """Where the mask of `path`, of `size`, has the object."""
+        """Read where the mask of `path`, of `size`, has the object."""
         where = _upright(read_mask(Path(self.mask)), Path(self.mask))
         if where.shape != size:
             (h, w), (rows, columns) = where.shape, size
@@ -249,7 +249,7 @@ def area_resample(
 
 
 def _overlaps(start: float, step: float, new: int, old: int) -> Float[np.ndarray, "new old"]:
-    """How much of each new pixel, `step` old ones wide, lies on each old one; widened to 1 it is a tent's weight."""
+    """Compute the share of each new pixel, `step` old ones wide, on each old one; widened to 1 it is a tent's."""
     centres = start + (np.arange(new) + 0.5) * step
     reach = max(step, 1.0)
     distances = np.abs(centres[:, None] - (np.arange(old) + 0.5))

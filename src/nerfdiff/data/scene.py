@@ -1,4 +1,4 @@
-"""What every dataset reader yields, whatever lay on disk."""
+"""Scenes as every dataset reader yields them, whatever lay on disk."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -66,9 +66,9 @@ class SceneReader(Protocol):
     """One split of one dataset: an ordered collection of scenes read lazily from disk."""
 
     identity: str
-    """What is read and how (folder and settings): two readers of one identity read the same files alike."""
+    """Names the folder and settings that are read: two readers of one identity read the same files alike."""
     nearest_view: bool
-    """Whether the number of a view that a scene lacks means the nearest one that it has."""
+    """True if the number of a view that a scene lacks stands for the nearest one that it has."""
 
     def __len__(self) -> int:
         """Number of scenes."""

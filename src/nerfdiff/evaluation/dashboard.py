@@ -127,7 +127,7 @@ def _hparams(row: ResultRow, ignored: Sequence[str]) -> dict[str, Any]:
 
 
 def _metrics(row: ResultRow) -> dict[str, float]:
-    """What was measured, by tag; what is no number cannot be shown.
+    """Return a row's measured numbers by tag.
 
     TensorBoard sorts tags by name, and its HPARAMS tab shows the first few until asked for more.
     """

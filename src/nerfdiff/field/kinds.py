@@ -26,7 +26,7 @@ TRIPLANE = "triplane"
 
 
 class FieldKind(ABC):
-    """What a kind of single-image NeRF has to say of itself.
+    """A kind of single-image NeRF: its networks, and its field.
 
     `has_context` says whether its encoder gives the CDM features to attend to.
     """

@@ -21,7 +21,7 @@ def ray_distance(depth: Float[Tensor, "views h w"], cameras: Cameras) -> Float[T
 
 
 def scene_distances(scene: Scene) -> tuple[Float[Tensor, " n"], str]:
-    """How far from the cameras the scene is, and by which evidence.
+    """Find how far from the cameras the scene is, and by which evidence.
 
     Returns:
         ray distances of every pixel that hit something, "surfaces"; without depth the cameras' distances from where
@@ -38,7 +38,7 @@ def scene_distances(scene: Scene) -> tuple[Float[Tensor, " n"], str]:
 
 @dataclass(frozen=True)
 class Bounds:
-    """What the cameras see lies between near and far; without depth, what they look at does.
+    """Check that near and far enclose the visible surface; without depth, the point the cameras look at.
 
     Where the background is a real one (None), surfaces beyond far belong to it and are drawn at far: only what masks
     hold must lie between, and where there are no masks, nothing nearer than near.

@@ -16,7 +16,7 @@ INSIDE, OUTSIDE = "#4c78a8", "#d62728"
 
 @dataclass(frozen=True)
 class Distances:
-    """Of one scene, and its bounds; `evidence` says what the distances are of."""
+    """Distances in one scene, and its bounds; `evidence` says of what the distances are."""
 
     values: Float[np.ndarray, " n"]
     near: float

@@ -1,4 +1,4 @@
-"""Where the cameras stand and where they look: frustums in 3D, as one picture."""
+"""Plot of the cameras: frustums in 3D, as one picture."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class PlottedCameras:
 
     @property
     def centre(self) -> Float[np.ndarray, "3"]:
-        """Where the cameras look, or their middle where their axes are parallel."""
+        """Point the cameras look at, or their middle where their axes are parallel."""
         cameras = self.cameras.to(torch.float64)
         point = look_at_point(cameras) if len(cameras) > 1 and turn(cameras) > 1 else cameras.centres.mean(0)
         return point.numpy()

@@ -1,4 +1,4 @@
-"""What a check says of one scene, and what the scenes of a split say together."""
+"""Findings of checks: of one scene, and of a split's scenes together."""
 
 import statistics
 from collections import Counter
@@ -36,7 +36,7 @@ class Finding:
 
 @runtime_checkable
 class Measure(Protocol):
-    """How findings are judged together.
+    """A check whose findings are judged together.
 
     `measures` says what their values are; `higher_is_better` how to read them; `tolerated` is the share of scenes that
     may fail before the split does.
@@ -95,7 +95,7 @@ class Verdict:
 
 
 def verdict(name: str, check: Measure, findings: Mapping[str, Finding]) -> Verdict:
-    """What the findings of a split's scenes, by scene id, come to."""
+    """Judge the findings of a split's scenes, given by scene id."""
     made = {scene: finding for scene, finding in findings.items() if finding.status is not Status.UNCHECKED}
     if not made:
         reasons = Counter(finding.reason for finding in findings.values())

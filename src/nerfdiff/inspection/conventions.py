@@ -1,4 +1,4 @@
-"""Which misreading of the cameras would explain that they do not fit their images?"""
+"""Search for a misreading of the cameras that would explain why they do not fit their images."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace

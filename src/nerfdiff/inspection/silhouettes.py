@@ -81,8 +81,8 @@ class Silhouettes:
         return Finding.judged(coverage, reason)
 
     def _foreground(self, scene: Scene, views: list[int]) -> Bool[Tensor, "views h w"] | None:
-        """What differs from the background, or the mask, or both: masks know parts in the background's colour, colours
-        know parts thinner than a pixel."""
+        """Mark pixels that differ from the background, or the mask, or both: masks know parts in the background's
+        colour, colours know parts thinner than a pixel."""
         masks = None if scene.mask is None else scene.mask[views]
         if self.background is None:
             return masks

@@ -32,7 +32,7 @@ class Range:
 
 @dataclass(frozen=True)
 class SplitSummary:
-    """What the report says of one split.
+    """The report's facts on one split.
 
     Args:
         stage: "train", "val" or "test"; `split` is the dataset's name for it.
@@ -71,7 +71,7 @@ class SplitSummary:
 
     @property
     def failures(self) -> list[str]:
-        """What is wrong with the split, in a few words each."""
+        """List the split's faults, in a few words each."""
         failed = [f"{check.check} failed" for check in self.checks if check.status is Status.FAILED]
         bad = [f"{len(self.bad)} bad scene{'s' if len(self.bad) > 1 else ''}"] if self.bad else []
         unchecked = self.scenes_read and not self.compared and not self.allow_unchecked

@@ -20,7 +20,7 @@ from nerfdiff.utils.errors import UserError
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """What is kept of a scene that was read.
+    """Findings kept of a scene that was read.
 
     Args:
         source: position of the input view among the views that were read.
@@ -43,7 +43,7 @@ class SceneRecord:
 
 @dataclass
 class SplitSurvey:
-    """What was found in one split.
+    """Findings in one split.
 
     Args:
         views: views per scene, of all scenes that could be listed.
@@ -64,7 +64,7 @@ class SplitSurvey:
 
 @dataclass(frozen=True)
 class Sample:
-    """How much of a split is read.
+    """The part of a split that is read.
 
     Args:
         scenes: how many, at random (None: all).

@@ -66,7 +66,7 @@ class Consistency:
     _known: dict[str, float | None] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def measures(self, number: int) -> bool:
-        """Whether scene `number` is one of those to measure."""
+        """Return true if scene `number` is one of those to measure."""
         return self.scenes is None or number < self.scenes
 
     def measure_truth(

@@ -16,7 +16,7 @@ from nerfdiff.render.renderer import Renderer
 def outside_hull(
     points: Float[Tensor, "n 3"], cameras: Cameras, silhouettes: Bool[Tensor, "views h w"]
 ) -> Bool[Tensor, "n"]:
-    """Whether some camera [views] that has a point in its image sees background there.
+    """Return true where some camera [views] that has a point in its image sees background there.
 
     The visual hull is what is left; where no camera looks, nothing is known and nothing is outside.
     """

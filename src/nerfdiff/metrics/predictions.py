@@ -86,7 +86,7 @@ class PredictionWriter:
             write_text(self.folder / PLAN, json.dumps(plan, indent=1) + "\n")
 
     def _is_lost(self) -> bool:
-        """Whether a power cut left nothing of the plan, and nothing was made by it."""
+        """Return true if a power cut left nothing of the plan, and nothing was made by it."""
         return not (self.folder / PLAN).stat().st_size and not any(self.folder.glob(f"*/{SCENE}"))
 
     def _check(self, plan: dict[str, Any]) -> None:
@@ -110,7 +110,7 @@ class PredictionWriter:
         return tuple(scene for scene in self.scenes if not (self.folder / scene / SCENE).exists())
 
     def claim(self, scene: str, wait: bool = False) -> bool:
-        """Whether a scene is this process's to make, until it is released: none else makes it, and it is not complete.
+        """Claim a scene for this process until it is released; false if another makes it, or it is complete.
 
         Args:
             wait: for another process to complete the scene, or to die over it.

@@ -91,7 +91,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def read_scores(path: Path) -> dict[str, dict[str, float]]:
-    """What was measured of each scene: values by metric.
+    """Read the measured values of each scene, by metric.
 
     Raises:
         DataError: the file is missing or damaged.

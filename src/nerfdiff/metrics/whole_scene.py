@@ -1,4 +1,4 @@
-"""What is measured of a scene as a whole, in the space of its input camera: floaters, flatness, agreement of views."""
+"""Measures of a scene as a whole, in the space of its input camera: floaters, flatness, agreement of views."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from nerfdiff.utils.randomness import generator
 
 @dataclass(frozen=True)
 class Geometry:
-    """How floaters and depth extent are measured.
+    """Measures floaters and depth extent.
 
     Args:
         floater_views: true views that carve the hull and that rays are drawn from, at most, evenly spread.

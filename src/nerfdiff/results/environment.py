@@ -1,4 +1,4 @@
-"""What a number was measured on, and with which code."""
+"""The hardware, versions and code that a number was measured with."""
 
 import platform
 import subprocess

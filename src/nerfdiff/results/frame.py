@@ -48,7 +48,7 @@ class Run:
 
     @property
     def astray(self) -> bool:
-        """Whether it names a folder that is there, and not within the results."""
+        """Return true if it names a folder that is there, and not within the results."""
         return (
             self.row.folder is not None
             and self.file() is None
@@ -145,7 +145,7 @@ class Configuration:
 
     @property
     def row(self) -> ResultRow:
-        """Of its first seed."""
+        """Row of its first seed."""
         return self.runs[0].row
 
     @property
@@ -193,7 +193,7 @@ def configuration_columns() -> list[str]:
 
 
 def configuration_line(configuration: Configuration) -> dict[str, object]:
-    """Who it is, then `<name>`, `<name>_low` and `<name>_high` of each estimate."""
+    """Return a table's line: identity, then `<name>`, `<name>_low` and `<name>_high` of each estimate."""
     row = configuration.row
     line: dict[str, object] = dict.fromkeys(configuration_columns())
     line |= {name: getattr(row, name) for name in IDENTITY}
@@ -214,7 +214,7 @@ def _identity(run: Run) -> str:
 
 
 def _attempt(run: Run) -> tuple:
-    """What is known of a run from its start, however early it failed: its device may not be."""
+    """Return the facts known from a run's start, however early it failed; its device may be unknown."""
     return run.settings, run.row.strategy
 
 
@@ -254,7 +254,7 @@ def _per_scene(runs: Sequence[Run], warn: Callable[[str], object]) -> tuple[list
 
 
 def _read_scenes(run: Run, warn: Callable[[str], object]) -> dict[str, dict[str, float]]:
-    """What was measured of each scene; nothing where the scores are no longer beside the results."""
+    """Read the scores of each scene; empty where they are no longer beside the results."""
     path = run.file("scores", str(run.row.strategy), "per_scene.csv")
     if path is None:
         return {}

@@ -1,4 +1,4 @@
-"""Which configurations nothing else beats."""
+"""Frontier of configurations: those that nothing else beats."""
 
 import numpy as np
 from jaxtyping import Float

@@ -1,4 +1,4 @@
-"""How far a mean over scenes can be trusted: bootstrap intervals over the scenes."""
+"""Bootstrap intervals of means over scenes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -80,7 +80,7 @@ def _draws(seed: int, draws: int, scenes: int, seeds: int) -> tuple[np.ndarray, 
 
 
 def _shares(rng: np.random.Generator, draws: int, among: int) -> Float[np.ndarray, "draws among"]:
-    """How often each is among as many drawn with replacement, as a share."""
+    """Draw with replacement as often as there are items; return each one's share."""
     drawn = rng.integers(among, size=(draws, among)) + among * np.arange(draws)[:, None]
     return np.bincount(drawn.ravel(), minlength=draws * among).reshape(draws, among) / among
 

@@ -1,4 +1,4 @@
-"""What TensorBoard's tabs show beside scalars and images: hyperparameters, texts and a first screen."""
+"""TensorBoard's tabs beside scalars and images: hyperparameters, texts and a first screen."""
 
 import math
 import re

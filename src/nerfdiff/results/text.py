@@ -10,7 +10,7 @@ from typing import Any
 from nerfdiff.utils.files import atomic
 
 INVISIBLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]+")
-"""What moves a cursor, colours a terminal, begins a line or turns the direction of writing."""
+"""Characters that move a cursor, colour a terminal, begin a line or turn the direction of writing."""
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 

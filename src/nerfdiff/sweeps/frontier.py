@@ -1,4 +1,4 @@
-"""Which lines of a sweep nothing else beats: as good for less."""
+"""Frontier of a sweep's lines: those that nothing else beats."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

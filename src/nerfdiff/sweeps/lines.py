@@ -1,4 +1,4 @@
-"""What a sweep measured: one line per group of jobs, over its seeds and scenes."""
+"""Lines of a sweep's table: one line per group of jobs, over its seeds and scenes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -162,7 +162,7 @@ def _status(group: Group) -> str:
 
 
 def _error(group: Group, lost: str | None) -> str | None:
-    """What the jobs say, each saying once: also of scenes that fell back in jobs that succeeded."""
+    """Join the jobs' errors, each once; scenes that fell back in jobs that succeeded count too."""
     said = dict.fromkeys(job.row.error for job in group.jobs if job.row and job.row.error)
     return "; ".join(filter(None, [*said, lost])) or None
 

@@ -1,4 +1,4 @@
-"""Which configurations of a space a sweep tries: all of them, or some drawn at random."""
+"""Proposals of configurations to try: all of them, or some drawn at random."""
 
 import random
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ class Proposals(Protocol):
     """Names the configurations of a sweep, those that have been tried before among them."""
 
     def known(self, space: Space, tried: Tried) -> list[Configuration]:
-        """What is to be tried whatever comes of it, in this order."""
+        """List configurations to try whatever comes of them, in this order."""
 
     def more(self, space: Space, tried: Tried, size: int) -> list[Configuration]:
         """At most `size` others, now that the known ones have been `tried`; none at the end."""

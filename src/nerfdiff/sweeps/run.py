@@ -109,7 +109,7 @@ class Run:
         return tried
 
     def _batches(self, known: Iterable[Configuration]) -> Iterable[list[Job]]:
-        """What is to do of the known configurations; all seeds of one are in the same batch."""
+        """Batch the jobs still to do of known configurations; all seeds of one are in the same batch."""
         rows = self._rows()
         to_do = [[job for job in self._jobs(configuration) if self._to_do(job, rows)] for configuration in known]
         to_do = [jobs for jobs in to_do if jobs]

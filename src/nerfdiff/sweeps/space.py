@@ -183,14 +183,14 @@ def _branch(
 
 
 def _matters(key: str, used: set[str], indirect: Sequence[str]) -> bool:
-    """Whether something reads the key: for one in an indirect node, an interpolation to it or around or within it."""
+    """Return true if something reads the key; one in an indirect node, through an interpolation to, around or in it."""
     if key.partition(".")[0] not in indirect:
         return True
     return any(f"{key}.".startswith(f"{other}.") or other.startswith(f"{key}.") for other in used)
 
 
 def _exists(config: DictConfig, word: str) -> bool:
-    """Whether a config has the key of an override, and those of a mapping that is to be merged into it."""
+    """Return true if a config has the key of an override, and those of a mapping that is to be merged into it."""
     (override,) = parse([word])
     if override.is_add() or override.is_force_add() or override.is_delete():
         return True
@@ -206,7 +206,7 @@ def _has(config: DictConfig, key: str, value: object) -> bool:
 
 
 def _used(config: dict, without: Sequence[str]) -> set[str]:
-    """What the interpolations outside of some nodes refer to, and what those refer to in turn.
+    """Collect the keys that interpolations outside of some nodes refer to, and what those refer to in turn.
 
     Args:
         config: with its interpolations as text.

@@ -1,4 +1,4 @@
-"""What a launcher runs in place of the command's function."""
+"""The function that a launcher runs in place of the command's."""
 
 import logging
 import time

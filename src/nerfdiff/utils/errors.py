@@ -33,7 +33,7 @@ class ProcessLost(UserError, RuntimeError):
 
 
 class OutOfMemory(UserError, MemoryError):
-    """What was asked for takes more memory than the device has free."""
+    """More memory was asked for than the device has free."""
 
 
 class TimeUp(UserError):
@@ -41,7 +41,7 @@ class TimeUp(UserError):
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether a device's memory ran out; PyTorch says so of a CPU's in words only."""
+    """Return true if a device's memory ran out; PyTorch says so of a CPU's in words only."""
     words = "can't allocate memory", "not enough memory", "CUDA out of memory"
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(w in str(error) for w in words))
 

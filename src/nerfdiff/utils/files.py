@@ -138,7 +138,7 @@ def held(folder: Path, patience: float = 15.0) -> Iterator[None]:
 
 
 def _was_killed(owner: Path) -> bool:
-    """Whether the process that says it holds a folder is one of this machine that is no more."""
+    """Return true if the process that says it holds a folder is one of this machine that is no more."""
     try:
         _, pid, _, host = owner.read_text(encoding="utf-8").split(maxsplit=3)
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""How much memory there is, was taken at most, and that what is freed stays with the process for the next tensors.
+"""Memory: how much is free, the peak, and a setting that keeps freed memory with the process.
 
 PyTorch is imported where it is needed: every command imports this module.
 """

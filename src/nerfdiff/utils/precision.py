@@ -1,4 +1,4 @@
-"""Where bf16 must not go: coordinates, compositing, camera algebra."""
+"""Contexts that keep bf16 out of coordinates, compositing, camera algebra."""
 
 from contextlib import AbstractContextManager, nullcontext
 

@@ -59,7 +59,7 @@ class PartClock:
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """What `timed` marks in here is timed by this clock."""
+        """Time the pieces that `timed` marks in here."""
         token = PartClock._running.set(self)
         try:
             yield
@@ -67,7 +67,7 @@ class PartClock:
             PartClock._running.reset(token)
 
     def seconds(self) -> dict[str, list[float]]:
-        """Of each part's pieces. Waits for the device."""
+        """Return the seconds of each part's pieces. Waits for the device."""
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
         parts: dict[str, list[float]] = {}

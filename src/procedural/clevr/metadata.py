@@ -21,7 +21,7 @@ def facts_path(root: Path, index: int) -> Path:
 
 
 def scene_facts(objects: Sequence[ClevrObject], centres: Float[np.ndarray, "views 3"]) -> dict[str, Any]:
-    """What `write_metadata` collects of one scene."""
+    """Return one scene's facts, which `write_metadata` collects."""
     return {"camera_pos": centres.tolist(), "objects": [item.facts() for item in objects]}
 
 

@@ -1,4 +1,4 @@
-"""What stands on CLEVR's table: shapes, sizes, colours, materials and a layout without collisions."""
+"""Objects on CLEVR's table: shapes, sizes, colours, materials and a layout without collisions."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -52,7 +52,7 @@ class ClevrObject:
         return tuple(value / 255 for value in COLOURS[self.colour])
 
     def facts(self) -> dict[str, Any]:
-        """As plain values."""
+        """Return the facts as plain values."""
         return asdict(self)
 
 

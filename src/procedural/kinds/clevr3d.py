@@ -124,7 +124,7 @@ class Clevr3DScenes:
         return ClevrWorld(objects, rng.uniform(-self.lamp_jitter, self.lamp_jitter, (len(LAMPS), 3)))
 
     def centres(self, job: SceneJob) -> Float[np.ndarray, "3 3"]:
-        """Where the three cameras stand: 120° apart about the vertical, each at its own distance."""
+        """Return the three cameras' centres: 120° apart about the vertical, each at its own distance."""
         rng = stream(self.seed, self.category, job, "cameras")
         x, y, z = np.array(self.camera) + rng.uniform(-self.jitter, self.jitter, 3)
         angles = np.arctan2(y, x) + np.arange(VIEWS) * 2 * np.pi / VIEWS

@@ -1,4 +1,4 @@
-"""What all kinds of scene have in common: one job per scene, all randomness from its place in the set."""
+"""Base of all kinds of scene: one job per scene, all randomness from its place in the set."""
 
 import zlib
 from collections.abc import Mapping, Sequence
@@ -36,10 +36,10 @@ class SceneKind(Protocol):
         """All settings of this kind alone that files depend on."""
 
     def split_folder(self, split: str) -> str:
-        """Where a split lies, relative to the root."""
+        """Return a split's folder, relative to the root."""
 
     def complete(self, job: SceneJob) -> bool:
-        """Whether the scene is there already."""
+        """Return true if the scene is there already."""
 
     def make(self, job: SceneJob, renderer: MitsubaRenderer) -> None:
         """Render the scene and write its files, all or none.

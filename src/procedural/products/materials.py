@@ -1,4 +1,4 @@
-"""What products are made of: colours with a pattern over them."""
+"""Materials of products: colours with a pattern over them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

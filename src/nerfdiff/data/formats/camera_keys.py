@@ -37,7 +37,7 @@ LISTS = {
 FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 MODEL = ("camera_model", "camera_type", "is_fisheye")
 READ = (*FOCAL, "cx", "cy", "w", "h", *MODEL, *NERFSTUDIO, "k5", "k6", "mask_path")
-"""What a camera is read from, by nerfstudio's names."""
+"""Keys of a camera that are read, by nerfstudio's names."""
 KNOWN = {*READ, *ALIASES, *DEGREES, *MATRICES, *LISTS}
 MISSPELT = {name.lower() for name in KNOWN} - {"k", "f"}
 """Refused where they are written with other capitals."""
@@ -99,7 +99,7 @@ def frame_camera(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str,
 
 
 def _spelled(key: str, value: Any, where: str) -> dict[str, Any]:
-    """What another spelling gives, by the names of `READ`."""
+    """Translate another spelling of a key to the names of `READ`."""
     if key in ALIASES:
         return dict.fromkeys(ALIASES[key], value)
     if key in DEGREES:

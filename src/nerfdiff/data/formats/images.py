@@ -15,7 +15,7 @@ from nerfdiff.data.formats.posed_files import ASPECT_TOLERANCE, require_file
 from nerfdiff.utils.errors import DataError
 
 MAX_PIXELS = 64_000_000
-"""Of an image, which takes some 25 bytes of memory each until it is resized."""
+"""Most pixels of an image; each takes some 25 bytes of memory until it is resized."""
 READ_FORMATS = {b"\x89PNG": "PNG", b"\xff\xd8\xff": "JPEG", b"RIFF": "WebP"}
 """First bytes of what most images are: one of these that Pillow does not know is damaged."""
 log = logging.getLogger(__name__)
@@ -177,7 +177,7 @@ def open_image(path: Path) -> Image.Image:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """What Pillow raises on missing and damaged files, as one error that names the file."""
+    """Turn Pillow's errors on missing and damaged files into one that names the file."""
     try:
         require_file(path)
         yield
@@ -193,7 +193,7 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 def _unidentified(path: Path) -> str:
-    """What is wrong with a file that Pillow does not know, and what to do."""
+    """Say what is wrong with a file that Pillow does not know, and what to do."""
     with open(path, "rb") as file:
         head = file.read(64)
     damaged = [name for first, name in READ_FORMATS.items() if head.startswith(first)]

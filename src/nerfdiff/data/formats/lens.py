@@ -69,7 +69,7 @@ class Lens:
         return Lens(where, (k1, k2, k3, k4), (p1, p2)) if any((k1, k2, k3, k4, p1, p2)) else None
 
     def image(self, pixels: UInt8[np.ndarray, "height width 3"], K: np.ndarray) -> UInt8[np.ndarray, "height width 3"]:
-        """What a pinhole of the same K would have taken, bilinear; beyond the stored image its border goes on.
+        """Resample to the image of a pinhole with the same K, bilinear; beyond the stored image its border goes on.
 
         Raises:
             DataError: the coefficients leave less than half of the image.
@@ -111,7 +111,7 @@ class Lens:
 def _sampling_map(
     radial: tuple[float, ...], tangential: tuple[float, float], camera: tuple[float, ...]
 ) -> tuple[Float32[Tensor, "height width"], Float32[Tensor, "height width"], Bool[Tensor, "height width"]]:
-    """Where each undistorted pixel is seen in the stored image, in kornia's pixels, and whether it is.
+    """Find each undistorted pixel's place in the stored image, in kornia's pixels, and whether it has one.
 
     Frames of one camera share the map, which takes longer than its use.
     """

@@ -14,11 +14,11 @@ RIGID_TOLERANCE = 1e-3
 MAX_POSITION = 1e12
 """Coordinates whose powers single precision still holds."""
 UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-"""Of a file that Windows PowerShell wrote, say."""
+"""Byte-order mark of a file that Windows PowerShell wrote, say."""
 ASPECT_TOLERANCE = 0.02
-"""How far the two scale factors may differ by rounding of the image size (640×480 stored as 107×80)."""
+"""Share by which the two scale factors may differ by rounding of the image size (640×480 stored as 107×80)."""
 FOCAL_RANGE = (1e-3, 1e5)
-"""Of focal lengths relative to the image's width: fields of view of 179.9° and of 2 seconds of arc."""
+"""Range of focal lengths relative to the image's width: fields of view of 179.9° and of 2 seconds of arc."""
 
 
 def read_numbers(path: Path, counts: tuple[int, ...], what: str) -> Float[np.ndarray, " count"]:
@@ -115,7 +115,7 @@ def inverse_pose(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
 
 
 def is_focal(f: float, width: float) -> bool:
-    """Whether a lens can have a focal length of `f` pixels in images of this width."""
+    """Return true if a lens can have a focal length of `f` pixels in images of this width."""
     return bool(FOCAL_RANGE[0] * width < f < FOCAL_RANGE[1] * width)
 
 

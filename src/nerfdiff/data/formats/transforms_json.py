@@ -106,7 +106,7 @@ class Transforms:
 
 
 def is_scene(folder: Path) -> bool:
-    """Whether the folder holds one of the files."""
+    """Return true if the folder holds one of the files."""
     return any((folder / name).is_file() for name in (ONE_FILE, *SPLIT_FILES))
 
 

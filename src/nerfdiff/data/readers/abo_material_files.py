@@ -68,7 +68,7 @@ def read_split(file: Path) -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class MaterialViews:
-    """What `metadata.json` says of the views, in the order of their numbers."""
+    """The views of a `metadata.json`, in the order of their numbers."""
 
     numbers: tuple[int, ...]
     poses: Float[np.ndarray, "views 4 4"]

@@ -127,7 +127,7 @@ class ABOMaterials:
         return len(self.scenes)
 
     def fingerprint(self) -> str:
-        """Of the times of change of folders and `metadata.json`; images overwritten in place are not noticed."""
+        """Digest the times of change of folders and `metadata.json`; images overwritten in place are not noticed."""
         parts = ("", KEY_FILE, "segmentation", "render")
         return folder_stamp(
             folder / part

@@ -38,7 +38,7 @@ IMAGES = r"{item}_\d+\.png"
 
 @dataclass(frozen=True)
 class ItemTransforms:
-    """What the file says of its views, in the order of the numbers at the ends of their names."""
+    """The views of a `transforms.json`, in the order of the numbers at the ends of their names."""
 
     views: tuple[str, ...]
     poses: Float[np.ndarray, "views 4 4"]
@@ -154,7 +154,7 @@ class ABORenders:
         return len(self.scenes)
 
     def fingerprint(self) -> str:
-        """Of the times of change of folders and `transforms.json`; images overwritten in place are not noticed."""
+        """Digest the times of change of folders and `transforms.json`; images overwritten in place are not noticed."""
         return folder_stamp(path for folder in self.folders for path in (folder, folder / KEY_FILE))
 
     def scene_id(self, index: int) -> str:

@@ -1,4 +1,4 @@
-"""What a scene's cameras look at, and bounds of the scene from it, where nobody states them."""
+"""Bounds of a scene from the point its cameras look at, where nobody states them."""
 
 import math
 from collections.abc import Sequence
@@ -21,12 +21,12 @@ STRAY = 4.0
 MAX_STRAYS = 0.2
 """Largest share of the cameras that may be astray: more of them are a second ring of cameras."""
 ROUNDS = 30
-"""Of reweighting, for the point with the least sum of distances from the axes."""
+"""Rounds of reweighting, for the point with the least sum of distances from the axes."""
 
 
 @dataclass(frozen=True)
 class Gaze:
-    """Where optical axes meet.
+    """The point where optical axes meet.
 
     Args:
         point: closest in the least-squares sense to the axes of all cameras but strays; of no meaning where the axes
@@ -61,7 +61,7 @@ class Gaze:
         )
 
     def describe_strays(self, names: Sequence[str]) -> str | None:
-        """Which of the views of these names are astray and how far, in words; None where none is."""
+        """Say which of these views are astray and how far; None where none is."""
         if not self.stray.any():
             return None
         middle = np.median(self.distances[~self.stray])
@@ -114,7 +114,7 @@ class Gaze:
 
 
 def _astray(c2w: Float[np.ndarray, "views 4 4"]) -> Bool[np.ndarray, " views"]:
-    """Which cameras stand at a quite different distance than the others; none where they are too many."""
+    """Mark cameras at a quite different distance than the others; none where they are too many."""
     if len(c2w) * MAX_STRAYS < 1:
         return np.zeros(len(c2w), bool)
     weights = np.ones(len(c2w))

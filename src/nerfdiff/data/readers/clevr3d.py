@@ -110,7 +110,7 @@ class Clevr3DReader:
         return len(self.scenes)
 
     def fingerprint(self) -> str:
-        """Of the metadata and of the time at which images last came, went or were renamed.
+        """Digest the metadata and the time at which images last came, went or were renamed.
 
         Of 300,000 images none is looked at, so one that is overwritten in place goes unnoticed.
         """
@@ -273,7 +273,7 @@ def camera_positions(metadata: Path) -> Float[np.ndarray, "scenes views 3"]:
 
 
 def object_counts(metadata: Path, scenes: int) -> Int[np.ndarray, " scenes"]:
-    """How many of each scene's slots in `shape` hold an object; 0 is an empty slot.
+    """Count how many of each scene's slots in `shape` hold an object; 0 is an empty slot.
 
     Raises:
         DataError: as `camera_positions`.

@@ -1,4 +1,4 @@
-"""Which part of a stored image is used, at which size; images, truth and intrinsics change together."""
+"""Cropping and resizing of stored images; images, truth and intrinsics change together."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

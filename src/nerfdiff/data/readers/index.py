@@ -1,4 +1,4 @@
-"""What a scan of a large dataset found, kept in a small file, so that the next start does not scan again."""
+"""Results of scanning a large dataset, kept in a small file, so that the next start does not scan again."""
 
 import hashlib
 import json
@@ -19,7 +19,7 @@ T = TypeVar("T")
 def cached_index(
     folder: str | Path, name: str, stamp: str, build: Callable[[], T], fresh: Callable[[T], bool] | None = None
 ) -> T:
-    """What `build` returns, from `<folder>/<name>.index.json` where that file has the same stamp.
+    """Return `build`'s value, from `<folder>/<name>.index.json` where that file has the same stamp.
 
     A file that is missing, damaged or outdated is written anew. Where it cannot be written, a warning says so
     and the next start builds again.

@@ -1,4 +1,4 @@
-"""Where in a large download the folders of its objects lie, found once and remembered."""
+"""Search for the objects' folders in a large download, done once and kept."""
 
 import os
 import re
@@ -8,7 +8,7 @@ from nerfdiff.data.readers.index import cached_index, index_name
 from nerfdiff.utils.errors import DataError, some
 
 DEPTH = 5
-"""How far below the root objects are looked for; archives keep their author's folders, up to four of them."""
+"""Levels below the root at which objects are looked for; archives keep their author's folders, up to four of them."""
 
 
 def item_folders(

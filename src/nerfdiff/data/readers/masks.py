@@ -53,7 +53,7 @@ def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
 
 
 def likely_misreading(masks: Sequence[Bool[np.ndarray, "_ _"]], max_border: float) -> str | None:
-    """Why the masks of a scene's views cannot be those of an object in them; None where they can.
+    """Say why the masks of a scene's views cannot be those of an object in them; None where they can.
 
     Args:
         max_border: share of its image's outermost pixels that a mask may cover; most masks of objects cover few.
@@ -109,7 +109,7 @@ def _indexed(image: Image.Image, path: Path) -> Bool[np.ndarray, "height width"]
 
 
 def _halved(levels: Real[np.ndarray, "height width"], what: str, kind: str | None) -> Bool[np.ndarray, "height width"]:
-    """Where levels are above half of the largest; any level but 0 where there is only one.
+    """Mark levels above half of the largest; any level but 0 where there is only one.
 
     Args:
         kind: of the file; that of JPEG alone has levels near those that were meant.

@@ -1,4 +1,4 @@
-"""Which camera convention poses follow, and what the cameras look at, found from the poses alone."""
+"""Detection of the camera convention, and of the point the cameras look at, from the poses alone."""
 
 import logging
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ class ObjectCameras:
         return replace(self, c2w=c2w, centre=np.zeros(3), distance=distance)
 
     def describe(self) -> str:
-        """What was found, in words."""
+        """Say in words what was found."""
         way = "world-to-camera" if self.inverted else "camera-to-world"
         names = {"opengl": "OpenGL/Blender", "opencv": "OpenCV"}
         return (

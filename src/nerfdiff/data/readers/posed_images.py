@@ -131,7 +131,7 @@ class PosedImagesReader:
         return len(self.folders)
 
     def fingerprint(self) -> str:
-        """Of the times of change of each scene's folder and what lies directly in it.
+        """Digest the times of change of each scene's folder and what lies directly in it.
 
         That is its JSON files and the folders of its images, so an image overwritten in place goes unnoticed.
         """

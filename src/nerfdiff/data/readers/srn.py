@@ -91,7 +91,7 @@ class SRNReader:
         return len(self.scenes)
 
     def fingerprint(self) -> str:
-        """Of names, sizes and times of change of all images, poses and intrinsics."""
+        """Digest names, sizes and times of change of all images, poses and intrinsics."""
         parts = ("", "rgb", "pose", "intrinsics")
         return fingerprint_folders(self.folder / scene / part for scene in self.scenes for part in parts)
 

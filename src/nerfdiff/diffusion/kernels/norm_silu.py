@@ -38,7 +38,7 @@ def sums_kernel(x, sums, pixels, C: tl.constexpr, CP: tl.constexpr, R: tl.conste
 @triton.jit
 @no_type_check
 def totals(sums, parts, C, channel, known):
-    """Both sums [parts, 2, C] of an image's parts, for each channel."""
+    """Load both sums [parts, 2, C] of an image's parts, for each channel."""
     first = tl.zeros(channel.shape, tl.float32)
     second = tl.zeros(channel.shape, tl.float32)
     for part in range(parts):

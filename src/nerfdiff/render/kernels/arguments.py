@@ -1,4 +1,4 @@
-"""What kernels are told of settings, fields and rays."""
+"""Arguments of kernels: settings, fields and rays."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Settings:
-    """What does not change from ray to ray.
+    """Settings that do not change from ray to ray.
 
     Args:
         uniform_samples, importance_samples, background, least_transmittance: as `Renderer`'s.
@@ -58,7 +58,7 @@ class Fields:
     b2: Float[Tensor, "*scenes 4"]
 
     def arguments(self, settings: Settings) -> dict:
-        """Of every kernel that evaluates a field."""
+        """Return the arguments of every kernel that evaluates a field."""
         return {
             "table": self.table,
             "K": self.K,
@@ -101,7 +101,7 @@ class Bundle:
 
 @dataclass(frozen=True)
 class Seen:
-    """What was seen along some rays.
+    """Samples along some rays.
 
     Args:
         distances: of the uniform samples, then of those drawn: both ascending.

@@ -11,7 +11,7 @@ from nerfdiff.render.kernels.samples import absorbed, four, store_four, store_ve
 @triton.jit
 @no_type_check
 def start(distances, uniform, drawn, row):
-    """Where a walk over both lists begins: the next place in each, and the next two distances of each."""
+    """Begin a walk over both lists: the next place in each, and the next two distances of each."""
     none, second = tl.zeros(row.shape, tl.int32), tl.full(row.shape, 1, tl.int32)
     return (
         none,

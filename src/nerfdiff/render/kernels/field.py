@@ -123,7 +123,7 @@ def project(frame, x, y, z):
 @triton.jit
 @no_type_check
 def places(u, v, w, valid, H: tl.constexpr, W: tl.constexpr):
-    """Of W_xy, W_xz and W_yz, whose columns run along x, x and z: texels (row, column) of each."""
+    """Return the texels (row, column) of W_xy, W_xz and W_yz, whose columns run along x, x and z."""
     across, down, deep = texel(u, valid, W), texel(v, valid, H), texel(w, valid, H)
     return (down, across), (deep, across), (down, deep if H == W else texel(w, valid, W))
 
@@ -194,7 +194,7 @@ def scene_field(
     scene, table, K, near, far, w2, b2, image_width, image_height,
     SHARED: tl.constexpr, HIDDEN: tl.constexpr, HP: tl.constexpr, H: tl.constexpr, W: tl.constexpr,
 ):  # fmt: skip
-    """What a program reads of a scene's field before its first point: texels, frustum and output layer.
+    """Load a scene's field before its first point: texels, frustum and output layer.
 
     The frustum: t_n, 1 / (t_f − t_n), and the intrinsics in units of the image's size.
     """

@@ -88,7 +88,7 @@ def fused_render(
 
 
 def _packed(table: Tensor, tensors: tuple[Tensor | None, ...]) -> tuple[Fields, Bundle]:
-    """As the kernels read them: contiguous."""
+    """Make tensors contiguous, as the kernels read them."""
     _, _, _, w2, b2, origins, directions, K, scene_near, scene_far, near, far, jitter, coarse = tensors
     frustum = (value.float().contiguous() for value in (K, scene_near, scene_far))
     rays = (value.contiguous() for value in (origins, directions, near, far))
@@ -105,7 +105,7 @@ def _gradients(
     d_outputs: tuple[Tensor, ...],
     needed: tuple[bool, ...],
 ) -> list[Tensor | None]:
-    """Of the first 7 tensors, where needed."""
+    """Compute gradients of the first 7 tensors, where needed."""
     planes, w1, _, w2 = tensors[:4]
     found = gradients(
         settings,

@@ -25,7 +25,7 @@ _gradient = Launch(
     added_to=["d_table", "d_w2"],
 )
 RAYS = 32
-"""Of a program that composites: a warp, a thread for each."""
+"""Rays of a program that composites: a warp, a thread for each."""
 SEGMENT = 32
 """Samples of a ray that a program takes, where it need not walk along all of them."""
 
@@ -142,7 +142,7 @@ def render(
 
 @dataclass(frozen=True)
 class Gradients:
-    """Of what was asked for.
+    """Compute the gradients that were asked for.
 
     Args:
         table: its units in the order of `texels.apart`.
@@ -252,7 +252,7 @@ def _part(scenes: int, first: int, count: int, samples: int) -> dict:
 
 
 def _walked(settings: Settings, bundle: Bundle, seen: Seen) -> dict:
-    """Of kernels that composite."""
+    """Return the arguments of kernels that composite."""
     opaque = settings.background is None
     return {
         "near": bundle.near,

@@ -9,7 +9,7 @@ from torch import Tensor
 from nerfdiff.utils.precision import full_precision
 
 MOST = 2.0**14
-"""Of a texel in fp16: three of them are summed, and no more than 65504 can be."""
+"""Largest texel in fp16: three of them are summed, and no more than 65504 can be."""
 
 
 def hidden_texels(
@@ -40,7 +40,7 @@ def texel_gradients(
     with_planes: bool,
     with_layer: bool,
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-    """Of planes, w1 and b1, where asked for.
+    """Compute gradients of planes, w1 and b1, where asked for.
 
     Args:
         d_table: the table's, its units in `apart`'s order.

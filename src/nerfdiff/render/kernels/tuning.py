@@ -8,7 +8,7 @@ import triton
 from nerfdiff.render.kernels.draw import draw_kernel
 
 INTERPRETED = not isinstance(draw_kernel, triton.JITFunction)
-"""Whether TRITON_INTERPRET was set when kernels were first imported: they then run on any device, slowly."""
+"""True if TRITON_INTERPRET was set when kernels were first imported: they then run on any device, slowly."""
 
 WARPS = 16
 """Programs of the backward pass for each multiprocessor, which each keep sums of the decoder's gradients."""

@@ -26,7 +26,8 @@ from torch.utils.tensorboard import SummaryWriter
 
 from nerfdiff.averages import PowerAverages
 from nerfdiff.cameras import Cameras
-from nerfdiff.checkpoint import LoadedModel, export_model, load_model
+from nerfdiff.checkpoint import DTYPES, LoadedModel, export_model, load_model
+from nerfdiff.compilation import compile_unets
 from nerfdiff.data.cache import CachedReader
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.data.views import spread
@@ -306,6 +307,8 @@ def train_resident(cfg: DictConfig) -> Path:
         began = time.monotonic()
         frozen = FrozenField(model, scenes, sources, cfg.encoded_at_once, autocast)
         log.info("%d renderings kept, %.1f s", frozen.rendered[..., 0, 0, 0].numel(), time.monotonic() - began)
+    compile_unets(model, cfg.compile, cfg.paths.compiled_dir)
+    torch.backends.cudnn.benchmark = cfg.benchmark
     step = Step(
         model, scenes, table, data.batch_size, frozen, plain(cfg.optimizer), cfg.gradient_clip_val, cfg.seed, autocast
     )
@@ -331,7 +334,7 @@ def train_resident(cfg: DictConfig) -> Path:
         stability={},
         trained_on=[*begun.trained_on, seen],
     )
-    return export_model(loaded, Path(cfg.paths.output_dir) / "model", torch.float32)
+    return export_model(loaded, Path(cfg.paths.output_dir) / "model", DTYPES[cfg.dtype])
 
 
 def _check(cfg: DictConfig) -> None:
@@ -340,6 +343,8 @@ def _check(cfg: DictConfig) -> None:
         raise ConfigError(f"part={cfg.part}: choose cdm (the field stays as it is) or joint")
     if cfg.precision not in ("bf16-mixed", "32-true"):
         raise ConfigError(f"precision={cfg.precision}: choose bf16-mixed or 32-true")
+    if cfg.dtype not in DTYPES:
+        raise ConfigError(f"dtype={cfg.dtype}: choose {', '.join(DTYPES)}")
     if cfg.optimizer.decay not in ("none", "cosine"):
         raise ConfigError(f"optimizer.decay must be none or cosine, got {cfg.optimizer.decay!r}")
     if cfg.average not in cfg.lengths:

@@ -25,6 +25,7 @@ from harness import Row, Unavailable, Work, interleaved, parser, settings_of
 from inner_step import steps_of
 from nerfdiff.cli import choices, load_config
 from nerfdiff.data.batch import ViewBatch
+from nerfdiff.diffusion.denoiser import cast_products
 from nerfdiff.diffusion.sampler import time_steps
 from nerfdiff.distill.distillation import Distillation
 from nerfdiff.distill.virtual_views import VirtualViews
@@ -205,6 +206,8 @@ def _ways(arguments: argparse.Namespace, measured: Subject, views: int) -> dict[
     backends = renderers(measured.model, measured.model.renderer)
     ways: dict[str, Way | Unavailable] = {}
     for unets, model in models(measured.model.requires_grad_(False), arguments.compile).items():
+        if unets != "eager" and measured.dtype == torch.bfloat16:  # copies, and as in evaluation
+            cast_products(model.denoiser, torch.bfloat16)
         for name, renderer in backends.items():
             if isinstance(renderer, Unavailable):
                 ways[f"{name}, {unets}"] = renderer

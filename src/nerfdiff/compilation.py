@@ -22,10 +22,9 @@ VERSIONS = {"unets": 32, "blocks": 256}
 def compile_unets(model: NerfDiff, choice: str, cache: str | Path, backend: str = "inductor") -> None:
     """Let `torch.compile` take the encoder's and the CDM's U-Net, or their blocks, when they are first called.
 
-    `unets` takes each U-Net as one region. `blocks` takes each `Stage`, and those of the same sizes once: of B's 54 only
-    36, of L's 74 only 36. Each call of a block then looks through the versions of the others, which costs nothing where
-    a CUDA graph replays them (`train_resident`). The renderer stays as it is: fused or not, it gained nothing when
-    compiled.
+    `unets` takes each U-Net as one region. `blocks` takes each `Stage`, and those of the same sizes once: 36 of B's 54,
+    36 of L's 74. Each call of a block then looks through the versions of the others, which costs nothing where a CUDA
+    graph replays them (`train_resident`). The renderer stays as it is: fused or not, it gained nothing when compiled.
 
     In place: names of parameters, checkpoints and copies (of which the average of the weights is one) are those of the
     plain model. Every number of images at once, with gradients or without, is compiled for itself.

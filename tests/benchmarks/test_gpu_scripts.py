@@ -47,7 +47,11 @@ def test_what_the_first_part_runs_is_there():
     tests = re.search(r'local tests="([^"]*)"', script).group(1).split()
     benchmarks = re.search(r'BENCHMARKS:-"([^"]*)"', script).group(1).split()
     budgets = re.search(r'budgets="([^"]*)"', script).group(1).split()
-    files = [*tests, *(f"benchmarks/{name}.py" for name in benchmarks), *(f"conf/budget/{name}.yaml" for name in budgets)]
+    files = [
+        *tests,
+        *(f"benchmarks/{name}.py" for name in benchmarks),
+        *(f"conf/budget/{name}.yaml" for name in budgets),
+    ]
     assert len(tests) > 4 and len(benchmarks) > 4 and len(budgets) == 2
     assert all((ROOT / name).exists() for name in files)
 

@@ -58,7 +58,11 @@ def test_weights_cast_once_denoise_as_those_that_autocast_casts_at_each_call(var
         assert torch.equal(net.denoiser(z, HALF, condition), each_call)
     assert list(net.state_dict()) == names
     types = {type(layer): layer.weight.dtype for layer in net.denoiser.modules() if hasattr(layer, "weight")}
-    assert types == {torch.nn.Conv2d: torch.bfloat16, torch.nn.Linear: torch.bfloat16, torch.nn.GroupNorm: torch.float32}
+    assert types == {
+        torch.nn.Conv2d: torch.bfloat16,
+        torch.nn.Linear: torch.bfloat16,
+        torch.nn.GroupNorm: torch.float32,
+    }
     assert {p.dtype for part in (net.encoder, net.decoder) for p in part.parameters()} == {torch.float32}
 
 

@@ -62,8 +62,8 @@ class NGDModule(LightningModule):
         kept, bins = fit.guidance(self._renderer).uniform_samples, self._renderer.uniform_samples
         if self.keeps_coarse and bins % kept:
             raise ConfigError(
-                f"strategy.coarse=refresh: the coarse weights of strategy.guidance_uniform_samples={kept} cannot be split "
-                f"into the model's {bins} bins evenly: choose a divisor of {bins}, or strategy.coarse=every_step"
+                f"strategy.coarse=refresh: weights of strategy.guidance_uniform_samples={kept} bins cannot be split "
+                f"into the model's {bins} evenly: choose a divisor of {bins}, or strategy.coarse=every_step"
             )
         self._split = bins // kept
         self.statuses = ["ok"] * len(field)

@@ -32,7 +32,9 @@ def test_every_experiment_composes_and_is_not_ignored(experiment):
 
 @pytest.mark.parametrize("trainer", ["auto", "cpu", "gpu", "ddp"])
 def test_every_trainer_composes(trainer):
-    assert load_config("train", [f"trainer={trainer}"]).trainer.max_steps == 500_000
+    cfg = load_config("train", [f"trainer={trainer}"])
+    assert cfg.trainer.max_steps == 500_000
+    OmegaConf.resolve(cfg.callbacks)
 
 
 STRATEGIES, BUDGETS = (sorted(p.stem for p in (CONF / group).glob("*.yaml")) for group in ("strategy", "budget"))

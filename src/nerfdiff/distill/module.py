@@ -154,7 +154,11 @@ class NGDModule(LightningModule):
             self.field.restore(after, ~worse)
         for scene, (finite, diverged) in enumerate(zip(self._finite.tolist(), worse.tolist(), strict=True)):
             self.statuses[scene] = "non-finite" if not finite else "diverged" if diverged else "ok"
-        del self._inner, self._batches  # module and Trainer hold each other: free the largest tensors now
+        del (
+            self._inner,
+            self._batches,
+            self._rendered,
+        )  # module and Trainer hold each other: free the largest tensors now
 
     def trace(self, scene: int) -> list[Step]:
         """Return one scene's record, step by step. Waits for the device."""

@@ -33,9 +33,12 @@ class FitSettings:
             their samples at once. Kept weights take 2 bytes for each bin of each ray of all views. Where teachers do
             not follow the field, nothing is rendered between inner steps, and weights are computed at every step.
         cuda_graphs: record an inner step once and replay it, on a GPU.
+        average: share of the teacher's steps, up to the last, over whose inner steps planes and decoder are averaged;
+            the mean is kept. 0 keeps what the last step left.
+        views_last: number of virtual views that are left at the last step, see `VirtualViews.choose`; None keeps all.
 
     Raises:
-        ConfigError: another `lr_decay` or `coarse`, no rays, or negative steps.
+        ConfigError: another `lr_decay` or `coarse`, no rays, negative steps, an `average` outside [0, 1], or no view.
     """
 
     inner_steps: int
@@ -48,6 +51,8 @@ class FitSettings:
     source_tolerance: float
     coarse: str
     cuda_graphs: bool
+    average: float = 0.0
+    views_last: int | None = None
 
     def __post_init__(self):
         if self.rays < 1 or self.inner_steps < 0:
@@ -56,3 +61,7 @@ class FitSettings:
             raise ConfigError(f"strategy.lr_decay={self.lr_decay!r}: choose {', '.join(DECAYS)}")
         if self.coarse not in COARSE:
             raise ConfigError(f"strategy.coarse={self.coarse!r}: choose {', '.join(COARSE)}")
+        if not 0 <= self.average <= 1:
+            raise ConfigError(f"strategy.average={self.average}: expected a share of the steps, from 0 to 1")
+        if self.views_last is not None and self.views_last < 1:
+            raise ConfigError(f"strategy.views_last={self.views_last} must be at least 1; null keeps all views")

@@ -57,14 +57,15 @@ class Confidence:
             depth: of the field, as distance along each ray.
         """
         size = depth.shape[-2:]
-        unit = cameras.rays(1.0, 1.0)
+        one = depth.new_ones(())
+        unit = cameras.rays(one, one)
         points = (unit.origins + unit.directions * depth[..., None]).flatten(2, 3)
         seen = torch.cat([images, depth[:, :, None]], 2)
         error, count = torch.zeros_like(depth), torch.zeros_like(depth)
         for other in _nearest(cameras.centres, self.neighbours).unbind(-1):
             theirs = Cameras(_of_view(cameras.c2w, other), _of_view(cameras.K, other), *size)
             pixels, z = theirs.project(points)
-            place = 2 * pixels / pixels.new_tensor(size[::-1]) - 1
+            place = torch.stack([2 * pixels[..., 0] / size[1] - 1, 2 * pixels[..., 1] / size[0] - 1], -1)
             looked_up = F.grid_sample(
                 _of_view(seen, other).flatten(0, 1),
                 place.reshape(-1, *size, 2),

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfdiff.cameras import Rays
-from nerfdiff.field.field import TriplaneField
+from nerfdiff.field.field import Field, TriplaneField
 from nerfdiff.fit.confidence import Confidence
 from nerfdiff.fit.perceptual import LEAST, STAlex
 from nerfdiff.render.renderer import Renderer
@@ -150,7 +150,7 @@ def total_variation(planes: Float[Tensor, "scenes 3 channels height width"]) -> 
 
 
 def ray_entropy(
-    field: TriplaneField, rays: Rays, jitter: Float[Tensor, "scenes n samples"]
+    field: Field, rays: Rays, jitter: Float[Tensor, "scenes n samples"]
 ) -> Float[Tensor, "scenes n"]:
     """Return how spread out along each ray is what it sees: the entropy of the weights of its samples and of what is
     behind them all, over its largest value (MVEdit's ray entropy, arXiv 2403.12032, over equal bins).

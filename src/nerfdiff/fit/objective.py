@@ -149,9 +149,7 @@ def total_variation(planes: Float[Tensor, "scenes 3 channels height width"]) -> 
     return sum(planes.diff(dim=axis).square().flatten(1).mean(1) for axis in (-2, -1) if planes.shape[axis] > 1)
 
 
-def ray_entropy(
-    field: Field, rays: Rays, jitter: Float[Tensor, "scenes n samples"]
-) -> Float[Tensor, "scenes n"]:
+def ray_entropy(field: Field, rays: Rays, jitter: Float[Tensor, "scenes n samples"]) -> Float[Tensor, "scenes n"]:
     """Return how spread out along each ray is what it sees: the entropy of the weights of its samples and of what is
     behind them all, over its largest value (MVEdit's ray entropy, arXiv 2403.12032, over equal bins).
 

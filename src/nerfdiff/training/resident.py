@@ -116,18 +116,31 @@ class FrozenField:
         sources: so many first views of a scene.
         batch: source views encoded at once.
         autocast: the context of the forward pass.
+        every_seconds: between lines on how far it is.
     """
 
     @torch.no_grad()
     def __init__(
-        self, model: NerfDiff, scenes: ResidentScenes, sources: int, batch: int, autocast: AbstractContextManager
+        self,
+        model: NerfDiff,
+        scenes: ResidentScenes,
+        sources: int,
+        batch: int,
+        autocast: AbstractContextManager,
+        every_seconds: float = math.inf,
     ):
         count, views = scenes.pixels.shape[:2]
         device = scenes.pixels.device
         pairs = torch.cartesian_prod(torch.arange(count), torch.arange(min(sources, views))).to(device)
         everything = torch.arange(views, device=device)
         rendered, context = [], []
-        for scene, source in (part.unbind(1) for part in pairs.split(batch)):
+        began = said = time.monotonic()
+        for number, (scene, source) in enumerate(part.unbind(1) for part in pairs.split(batch)):
+            if number and (now := time.monotonic()) - said > every_seconds:
+                share = number * batch / len(pairs)
+                left = (now - began) * (1 - share) / share
+                log.info("renderings of the frozen field: %.0f %% made, %.0f s left", 100 * share, left)
+                said = now
             own, all_views = scenes.cameras(scene, source, everything.expand(len(scene), -1))
             with autocast:
                 encoding = model.encode_images(scenes.images(scene, source), own, scenes.near[scene], scenes.far[scene])
@@ -304,7 +317,7 @@ def train_resident(cfg: DictConfig) -> Path:
         model.encoder.requires_grad_(False)
         model.decoder.requires_grad_(False)
         began = time.monotonic()
-        frozen = FrozenField(model, scenes, sources, cfg.encoded_at_once, autocast)
+        frozen = FrozenField(model, scenes, sources, cfg.encoded_at_once, autocast, cfg.every_seconds)
         log.info("%d renderings kept, %.1f s", frozen.rendered[..., 0, 0, 0].numel(), time.monotonic() - began)
     step = Step(
         model, scenes, table, data.batch_size, frozen, plain(cfg.optimizer), cfg.gradient_clip_val, cfg.seed, autocast

@@ -13,7 +13,7 @@ from nerfdiff.distill.trace import Step
 from nerfdiff.distill.virtual_views import VirtualViews
 from nerfdiff.fit.inner_steps import InnerSteps
 from nerfdiff.fit.objective import FitLoss, Objective
-from nerfdiff.fit.ray_batches import RayBatches
+from nerfdiff.fit.ray_batches import RayBatches, with_views
 from nerfdiff.fit.refined_field import RefinedField, choose
 from nerfdiff.fit.settings import DECAYS, FitSettings
 from nerfdiff.fit.weight_average import WeightAverage
@@ -213,9 +213,7 @@ class NGDModule(LightningModule):
         """Put what the chosen views have among zeros for the others."""
         if self._chosen is None:
             return chosen
-        every = chosen.new_zeros(*self.cameras.shape, *chosen.shape[2:])
-        rows = torch.arange(len(chosen), device=chosen.device)[:, None]
-        return every.index_put((rows, self._chosen), chosen)
+        return with_views(chosen.new_zeros(*self.cameras.shape, *chosen.shape[2:]), self._chosen, chosen)
 
     def _weigh(self, targets: SceneImages, depth: Float[Tensor, "scenes chosen height width"] | None) -> None:
         """Set how much the pixels of the chosen views weigh, if any differ; the input view's weigh 1."""

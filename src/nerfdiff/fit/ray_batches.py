@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int64, Shaped
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras, Rays
@@ -45,7 +45,7 @@ class RayBatches:
             height, width = self._size
             before = self._coarse if self._coarse is not None else coarse.new_zeros(len(self._table), coarse.shape[-1])
             every = before.reshape(self.shape[0], -1, height, width, coarse.shape[-1])
-            coarse = every.index_put((torch.arange(len(coarse), device=coarse.device)[:, None], self._views), coarse)
+            coarse = with_views(every, self._views, coarse)
         self._coarse = _kept(self._coarse, coarse.reshape(len(self._table), -1))
 
     def set_views(self, views: Int64[Tensor, "scenes chosen"] | None) -> None:
@@ -95,6 +95,16 @@ class RayBatches:
     def weights_at(self, picked: Int64[Tensor, "scenes n"]) -> Float[Tensor, "scenes n"] | None:
         """Return how much those rays weigh; None where they all weigh the same."""
         return None if self._weights is None else self._weights[picked + self._first]
+
+
+def with_views(
+    every: Shaped[Tensor, "scenes views *rest"],
+    views: Int64[Tensor, "scenes chosen"],
+    values: Shaped[Tensor, "scenes chosen *rest"],
+) -> Shaped[Tensor, "scenes views *rest"]:
+    """Return `every` with some views' entries replaced. (Not by `index_put`, which autocast refuses halves.)"""
+    rows = views + every.shape[1] * torch.arange(len(every), device=every.device)[:, None]
+    return every.flatten(0, 1).index_copy(0, rows.flatten(), values.flatten(0, 1)).reshape(every.shape)
 
 
 def _kept(before: Tensor | None, values: Tensor) -> Tensor:

@@ -74,7 +74,7 @@ for name in sys.argv[1:]:
     runpy.run_module(f"nerfdiff.commands.{name.replace('-', '_')}", run_name="__main__")
 """
     said = shell(sys.executable, "-c", code, *COMMANDS)
-    assert said.startswith(str(site)) and said.count("\nconditioning:") == 1 and said.count("\nckpt: ???") == 3
+    assert said.startswith(str(site)) and said.count("\nconditioning:") == 1 and said.count("\nckpt: ???") == 2
 
 
 def test_the_shipped_model_makes_a_scene_of_a_picture(site, shell, tmp_path):

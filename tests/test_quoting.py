@@ -84,5 +84,7 @@ def test_lists_are_written_with_commas_and_are_no_sweeps(tmp_path, monkeypatch):
         assert listed("export", f"field={name}", "format=glb,ply") == {"fields": [name], "format": ["glb", "ply"]}
     assert listed("export", "field=x.safetensors,y z.safetensors") == {"fields": ["x.safetensors", "y z.safetensors"]}
     assert listed("export", "field=[x,y]", "format=[glb]") == {"fields": ["x", "y"], "format": ["glb"]}
+    assert listed("picture", *NAMES, "elevation=8") == {"images": NAMES, "elevation": 8}
+    assert listed("picture", "image=a.jpg,b.jpg") == {"images": ["a.jpg", "b.jpg"]}
     assert gather_lists("train", ["field=triplane,pixelnerf", "-m"]) == ["field=triplane,pixelnerf", "-m"]
     assert load_config("export", ["format=ply"]).format == ["ply"]

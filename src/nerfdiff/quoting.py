@@ -15,10 +15,11 @@ PATHS = re.compile(r"ckpt|init|kept_renderings|image|mask|out|root|results|run|d
 
 LISTS: dict[str, dict[str, str]] = {
     "export": {"field": "fields", "format": "format"},
+    "picture": {"image": "images", "images": "images", "format": "format"},
 }
-"""By commands: words that take a list, and their keys, which are called otherwise where a group of configs has the word."""
+"""By commands: words that take a list, and their keys, which differ where a group of configs has the word."""
 
-BARE: dict[str, str] = {}
+BARE: dict[str, str] = {"picture": "images"}
 """By commands: the key that words without a key are values of."""
 
 
@@ -43,10 +44,9 @@ def gather_lists(command: str, words: Sequence[str]) -> list[str]:
             found.setdefault(bare, []).append(word)
         elif key not in lists or not equals:
             others.append(word)
-        elif value[:1] in ("[", "'", '"'):
+        elif not (whole := os.path.exists(os.path.expanduser(value))) and value[:1] in ("[", "'", '"'):
             others.append(f"{lists[key]}={value}")
         else:
-            whole = os.path.exists(os.path.expanduser(value))
             found.setdefault(lists[key], []).extend([value] if whole else filter(None, _split(value)))
     expanded = {key: [_literal(os.path.expanduser(value)) for value in values] for key, values in found.items()}
     return [*(f"{key}=[{','.join(values)}]" for key, values in expanded.items()), *others]

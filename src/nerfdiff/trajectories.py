@@ -63,7 +63,7 @@ class Upright:
 
     @staticmethod
     def assumed(distance: float, elevation: float) -> "Upright":
-        """Take the input camera to look at what is `distance` before it, down from `elevation` degrees, without roll."""
+        """Take the input camera to look at what is `distance` before it, down from `elevation` degrees."""
         tilt = math.radians(elevation)  # the input camera stands at the origin and looks along z, its y pointing down
         return Upright(torch.tensor([0.0, 0.0, distance]), torch.tensor([0.0, -math.cos(tilt), -math.sin(tilt)]))
 

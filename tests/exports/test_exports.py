@@ -36,7 +36,9 @@ def export_of(saved: SavedField, *overrides: str) -> FieldExport:
 @pytest.fixture(scope="module")
 def files(saved, tmp_path_factory):
     folder = tmp_path_factory.mktemp("exports")
-    return {path.suffix: path for path in export_of(saved).write(folder, "bars", ["glb", "obj", "ply", "mp4", "gif", "png"])}
+    return {
+        path.suffix: path for path in export_of(saved).write(folder, "bars", ["glb", "obj", "ply", "mp4", "gif", "png"])
+    }
 
 
 def srgb(linear):

@@ -7,18 +7,15 @@ from functools import cached_property
 from pathlib import Path
 
 import imageio.v2 as imageio
-import numpy as np
-import torch
 from hydra.utils import instantiate
 from jaxtyping import Float
 from omegaconf import DictConfig
-from PIL import Image
 from torch import Tensor
 
 from nerfdiff.evaluation.run import SAMPLES, choose_device
 from nerfdiff.exports.models import write_mesh, write_points
 from nerfdiff.exports.surface import Surface, SurfaceSettings
-from nerfdiff.exports.views import CameraPath, over, render_rgba
+from nerfdiff.exports.views import CameraPath, over, render_rgba, to_image
 from nerfdiff.fit.saved_field import FIELD, SavedField, load_field
 from nerfdiff.metrics.image import quantise
 from nerfdiff.results.pictures import orbit_video
@@ -110,10 +107,8 @@ class FieldExport:
         folder = path.with_name(f"{path.stem}_views")
         count = min(self.views, len(self.frames))
         for number in range(count):
-            rgba = self.frames[number * len(self.frames) // count]
-            pixels = (rgba.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
             with atomic(folder / f"{number:02d}.png") as temporary:
-                Image.fromarray(np.ascontiguousarray(pixels)).save(temporary)
+                to_image(self.frames[number * len(self.frames) // count]).save(temporary)
         return folder
 
 
@@ -136,7 +131,9 @@ def export_fields(cfg: DictConfig, fields: Sequence[str]) -> list[Path]:
         if export.saved.stands is None:
             log.warning(
                 "%s does not say how its scene stands: the camera is taken to look down from %g degrees "
-                "(source_elevation)", path, cfg.source_elevation,
+                "(source_elevation)",
+                path,
+                cfg.source_elevation,
             )
         written += export.write(Path(cfg.out or path.parent), field_name(path), cfg.format)
     return written

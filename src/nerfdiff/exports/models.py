@@ -38,9 +38,7 @@ def write_mesh(path: Path, surface: Surface, source: Cameras, stands: Upright) -
         DataError: the file cannot be written.
     """
     trimesh = _trimesh()
-    points, normals = (
-        to_y_up(at, source, stands).numpy() for at in (surface.points, surface.normals + stands.point)
-    )
+    points, normals = (to_y_up(at, source, stands).numpy() for at in (surface.points, surface.normals + stands.point))
     rgba = torch.cat([surface.colours, torch.ones(len(points), 1)], 1).numpy()
     common = {"vertices": points, "faces": surface.faces, "vertex_normals": normals, "process": False}
     with atomic(path) as temporary:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
+from PIL import Image
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras, Rays
@@ -120,3 +121,9 @@ def over(rgba: Float[Tensor, "views 4 h w"], grey: float) -> Float[Tensor, "view
     """Put pictures on a background of one grey level."""
     alpha = rgba[:, 3:]
     return rgba[:, :3] * alpha + (1 - alpha) * grey
+
+
+def to_image(rgba: Float[Tensor, "4 h w"]) -> Image.Image:
+    """A picture of 8 bits."""
+    pixels = (rgba.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0)
+    return Image.fromarray(pixels.contiguous().numpy())

@@ -55,7 +55,7 @@ def test_the_wheel_holds_what_a_checkout_has(site):
     for folder in ("conf", "assets"):
         files = {path.relative_to(PROJECT) for path in (PROJECT / folder).rglob("*") if path.is_file()}
         assert files and all((site / "nerfdiff" / file).read_bytes() == (PROJECT / file).read_bytes() for file in files)
-    for folder in ("procedural", "nerfdiff/chart"):
+    for folder in ("procedural", "nerfdiff/chart", "nerfdiff/exports"):
         files = [path.relative_to(PROJECT / "src") for path in (PROJECT / "src" / folder).rglob("*.*")]
         assert files and all((site / file).is_file() for file in files if file.suffix != ".pyc"), folder
     (info,) = site.glob("nerfdiff-*.dist-info")

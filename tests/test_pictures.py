@@ -15,7 +15,15 @@ from photographs import photograph
 
 SMALL = [
     *("budget.steps=1", "budget.sampler_steps=1", "budget.inner_steps=1", "budget.rays=64", "budget.views=2"),
-    *("path.frames=2", "height=16", "mesh.resolution=24", "mesh.colour_views=1", "points=100", "progress_every=null"),
+    *(
+        "path.frames=2",
+        "height=16",
+        "mesh.resolution=24",
+        "mesh.colour_views=1",
+        "points=100",
+        "viewer.cells=8",
+        "progress_every=null",
+    ),
 ]
 
 
@@ -35,7 +43,7 @@ def test_a_photograph_becomes_a_folder(photo, tmp_path, caplog, capsys):
     wagon = ASSETS / "pictures" / "wagon.png"
     car, second = made(tmp_path, f"images=['{photo}','{wagon}']", "elevation=8")
     names = {path.name for path in car.iterdir()}
-    files = {"field.safetensors", "scene.json", "views.png", "orbit.mp4"}
+    files = {"field.safetensors", "scene.json", "views.png", "orbit.mp4", "viewer.html"}
     assert names == files | {"mask.png", "cutout.png", "my_car.glb", "my_car.ply"}
     assert {path.name for path in second.iterdir()} == files | {"wagon.glb", "wagon.ply"}
     assert (

@@ -92,7 +92,8 @@ def _make(cfg: DictConfig, model: Model, image: Path, folder: Path) -> None:
     written = [_views(scene, batch.source[0].cpu(), folder / "views.png")]
     export = FieldExport.of(scene.saved, cfg)
     for kind in cfg.format:
-        written += export.write(folder, "orbit" if kind in ("mp4", "gif") else folder.name, [kind])
+        name = {"mp4": "orbit", "gif": "orbit", "html": "viewer"}.get(kind, folder.name)
+        written += export.write(folder, name, [kind])
     print(*written, sep="\n")
     more = " ".join([*command_words("export"), f"field={folder / FIELD}", "format=gif,png"])
     print(f"next: look at {written[0]}; for other files: {more}")
@@ -102,8 +103,8 @@ def _identity(cfg: DictConfig, model: Model, image: Path, mask: Mask | None) -> 
     """A digest of all that a scene depends on."""
     files = [sha256_file(file) for file in (image, model.loaded.path, cfg.picture.mask) if file is not None]
     found = None if mask is None else mask.where.tobytes().hex()
-    settings = [plain(cfg[key]) for key in ("strategy", "picture", "picture_views", "seed")]
-    return sha256_values([files, found, settings, str(model.device)])
+    settings = [plain(cfg[key]) for key in ("strategy", "picture", "picture_views")]
+    return sha256_values([files, found, settings, cfg.seed, str(model.device)])
 
 
 def _kept(folder: Path, identity: str, model: Model) -> Scene | None:

@@ -40,10 +40,11 @@ class Mask:
 class CutOut:
     """Find the object of a photograph.
 
-    A network of rembg's does where its weights are on this machine; nothing is downloaded. Else colours do, as in
-    GrabCut (SIGGRAPH 2004): what the border cannot reach without crossing edges is the first guess; mixtures of Gaussians
-    learn the colours of the object and of the rest, a random walk with these priors (Grady, CVPR 2005) cuts along edges,
-    and both are repeated. The edge is then refined at a higher resolution by a guided filter (ECCV 2010).
+    A network of rembg's does where its weights are on this machine; nothing is downloaded. Else colours and edges do,
+    as in GrabCut (SIGGRAPH 2004): what the border cannot reach without crossing edges is the first guess; mixtures of
+    Gaussians learn the colours of the object and of the rest, a random walk with these priors (Grady, CVPR 2005) cuts
+    along edges, and both are repeated. All of it happens twice, the second time around what was found. The edge is then
+    refined at a higher resolution by a guided filter (ECCV 2010).
 
     Args:
         weights: file of a network (ONNX, U²-Net's layout); None: those in rembg's folder (`U2NET_HOME`, `~/.u2net`).
@@ -169,7 +170,7 @@ class _Mixture:
 
     @staticmethod
     def of(colours: Float[np.ndarray, "n 3"], k: int) -> "_Mixture":
-        """Split the colours k - 1 times across the widest part (Orchard and Bouman 1991), and fit a Gaussian to each."""
+        """Split colours k - 1 times across the widest part (Orchard and Bouman 1991), and fit a Gaussian to each."""
         parts = [colours]
         while len(parts) < k:
             widest = max(parts, key=lambda part: len(part) * np.linalg.eigvalsh(_spread(part))[-1])

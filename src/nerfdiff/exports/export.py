@@ -1,7 +1,7 @@
 """Fields to files of other programs, by the settings of `conf/exports`."""
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,15 +15,17 @@ from torch import Tensor
 from nerfdiff.evaluation.run import SAMPLES, choose_device
 from nerfdiff.exports.models import write_mesh, write_points
 from nerfdiff.exports.surface import Surface, SurfaceSettings
+from nerfdiff.exports.viewer import write_viewer
 from nerfdiff.exports.views import CameraPath, over, render_rgba, to_image
 from nerfdiff.fit.saved_field import FIELD, SavedField, load_field
 from nerfdiff.metrics.image import quantise
 from nerfdiff.results.pictures import orbit_video
 from nerfdiff.trajectories import Upright
+from nerfdiff.utils.config import plain
 from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.files import atomic
 
-FORMATS = ("glb", "obj", "ply", "mp4", "gif", "png")
+FORMATS = ("glb", "obj", "ply", "html", "mp4", "gif", "png")
 
 log = logging.getLogger(__name__)
 
@@ -38,6 +40,7 @@ class FieldExport:
         views: pictures with transparency, of all along the path.
         background: grey level of videos.
         points: of the point cloud.
+        viewer: arguments of `write_viewer`.
     """
 
     saved: SavedField
@@ -49,6 +52,7 @@ class FieldExport:
     views: int
     background: float
     points: int
+    viewer: Mapping[str, int]
 
     @staticmethod
     def of(saved: SavedField, cfg: DictConfig) -> "FieldExport":
@@ -59,7 +63,9 @@ class FieldExport:
         middle = float(saved.field.near[0] + saved.field.far[0]) / 2
         stands = saved.stands or Upright.assumed(middle, cfg.source_elevation)
         numbers = {name: cfg[name] for name in ("fps", "height", "views", "background", "points")}
-        return FieldExport(saved, stands, instantiate(cfg.path), instantiate(cfg.mesh), **numbers)
+        return FieldExport(
+            saved, stands, instantiate(cfg.path), instantiate(cfg.mesh), viewer=plain(cfg.viewer), **numbers
+        )
 
     @cached_property
     def source(self):
@@ -93,6 +99,9 @@ class FieldExport:
 
     def _ply(self, path: Path) -> Path:
         return write_points(path, self.surface, self.source, self.stands, self.points)
+
+    def _html(self, path: Path) -> Path:
+        return write_viewer(path, self.saved, self.stands, path.stem, **self.viewer)
 
     def _mp4(self, path: Path) -> Path:
         return orbit_video(path, over(self.frames, self.background), self.fps)

@@ -23,7 +23,7 @@ def main(cfg: DictConfig) -> None:
         raise ConfigError("out must be given: add out=<folder> for the model's weights")
     from nerfdiff.checkpoint import export
 
-    print(export(cfg.ckpt, cfg.weights, cfg.out, cfg.dtype, cfg.paths.assets_dir, cfg.average, cfg.step))
+    print(export(cfg.ckpt, cfg.weights, cfg.out, cfg.dtype, cfg.paths.assets_dir, cfg.average, cfg.step, cfg.shared))
 
 
 if __name__ == "__main__":

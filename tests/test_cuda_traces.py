@@ -19,7 +19,6 @@ from nerfdiff.distill.none import SingleImageNeRF
 from nerfdiff.distill.sds import SDSTeacher
 from nerfdiff.distill.stochastic import StochasticTeacher
 from nerfdiff.distill.virtual_views import VirtualViews
-from nerfdiff.fit.confidence import Confidence
 from nerfdiff.fit.objective import Objective
 from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.fit.settings import FitSettings
@@ -151,9 +150,9 @@ def test_guide_and_inner_step(teacher, coarse, backend):
 @BACKENDS
 @pytest.mark.parametrize("teacher", ["ngd", "direct", "sds, fresh"])
 def test_a_step_with_all_parts_asks_nothing_of_the_host(teacher, backend):
-    """Patches with a perceptual loss, confidence, regularisers, the average of weights, fewer views."""
+    """Patches with a perceptual loss, regularisers, the average of weights, fewer views."""
     fresh = {"sds, fresh": lambda own: SDSTeacher(own, 1, 0.98, 0.02, "first", "sigma2", 1)}
-    sharp = Objective(SIDE, "l1", 0.1, 0.01, 0.01, Confidence(0.1))
+    sharp = Objective(SIDE, "l1", 0.1, 0.01)
     guide_and_step((TEACHERS | fresh)[teacher], "refresh", backend, sharp, average=1.0, views_last=1)
 
 

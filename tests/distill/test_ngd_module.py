@@ -15,7 +15,6 @@ from nerfdiff.distill.module import NGDModule
 from nerfdiff.distill.ngd import Guidance, NGDTeacher
 from nerfdiff.distill.sds import SDSTeacher
 from nerfdiff.distill.stochastic import StochasticTeacher
-from nerfdiff.fit.confidence import Confidence
 from nerfdiff.fit.objective import Objective
 from nerfdiff.fit.ray_batches import RayBatches
 from nerfdiff.fit.refined_field import RefinedField
@@ -130,7 +129,7 @@ def test_a_scene_does_not_depend_on_its_company(teacher, fit_source, coarse):
 
 
 SHARP = {
-    "objective": Objective(8, "l1", 0.1, 0.01, 0.01, Confidence(0.2)),
+    "objective": Objective(8, "l1", 0.1, 0.01),
     "average": 0.5,
     "views_last": 2,
     "fit_source": True,
@@ -160,7 +159,7 @@ def test_networks_of_the_loss_are_no_part_of_what_is_fitted_saved_or_averaged(mo
 
     def noted(self):
         made = configure(self)
-        fitted.append([value.shape for group in made[0][0].param_groups for value in group["params"]])
+        fitted.append([value.shape for group in made.param_groups for value in group["params"]])
         return made
 
     monkeypatch.setattr(NGDModule, "configure_optimizers", noted)

@@ -12,7 +12,7 @@ from nerfdiff.cameras import Cameras, Rays
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.fit.inner_steps import InnerSteps
-from nerfdiff.fit.objective import FitLoss, Objective, ray_entropy, total_variation
+from nerfdiff.fit.objective import FitLoss, Objective, ray_entropy
 from nerfdiff.fit.ray_batches import RayBatches
 from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.fit.weight_average import WeightAverage
@@ -150,7 +150,7 @@ def test_patches_that_cannot_be_are_refused(side, rays, message):
 
 def test_steps_on_patches_with_weights_and_regularisers_are_those_of_a_plain_loop():
     """Written out in one place; each scene's own, with all that an objective has."""
-    side, objective = 8, Objective(patch=8, loss="l1", perceptual_weight=0.2, entropy_weight=0.1, tv_weight=0.3)
+    side, objective = 8, Objective(patch=8, loss="l1", perceptual_weight=0.2, entropy_weight=0.1)
     field, images = fields(2), torch.rand(2, 2, 3, SIZE, SIZE)
     weights = torch.rand(2, 2, SIZE, SIZE)
     references = [copy.deepcopy(field.alone(scene)) for scene in range(2)]
@@ -188,7 +188,6 @@ def test_steps_on_patches_with_weights_and_regularisers_are_those_of_a_plain_loo
             rgb = RENDERER.render(reference.field(), chosen, jitter[step][None]).rgb
             loss, _ = patchwise(rgb, colours, weighed)
             few = Rays(**{name: values[:, ::8] for name, values in vars(chosen).items()})
-            loss = loss + 0.3 * total_variation(reference.planes)
             loss = loss + 0.1 * ray_entropy(reference.field(), few, jitter[step][None, ::8, :4]).mean()
             assert errors[step, scene].item() == pytest.approx((rgb - colours).square().mean().item(), rel=1e-4)
             optimizer.zero_grad()

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from nerfdiff.cameras import Rays
-from nerfdiff.fit.objective import FitLoss, Objective, ray_entropy, total_variation
+from nerfdiff.fit.objective import FitLoss, Objective, ray_entropy
 from nerfdiff.fit.perceptual import LEAST, STAlex, shift_tolerant
 from nerfdiff.utils.errors import ConfigError
 
@@ -52,29 +52,6 @@ def test_the_perceptual_loss_sees_patches_in_their_rows(weighed):
         assert float(losses[scene] - plain[scene]) == pytest.approx(0.3 * total / patches, rel=1e-4)
 
 
-def test_total_variation_is_that_of_a_loop_and_of_a_flat_plane_none():
-    planes = torch.rand(2, 3, 2, 3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    for scene in range(2):
-        down = [
-            float(planes[scene, p, c, i + 1, j] - planes[scene, p, c, i, j]) ** 2
-            for p in range(3)
-            for c in range(2)
-            for i in range(2)
-            for j in range(4)
-        ]
-        across = [
-            float(planes[scene, p, c, i, j + 1] - planes[scene, p, c, i, j]) ** 2
-            for p in range(3)
-            for c in range(2)
-            for i in range(3)
-            for j in range(3)
-        ]
-        expected = sum(down) / len(down) + sum(across) / len(across)
-        assert float(total_variation(planes)[scene]) == pytest.approx(expected)
-    assert total_variation(torch.ones(1, 3, 2, 4, 4)).item() == 0
-    assert torch.autograd.gradcheck(total_variation, planes.requires_grad_())
-
-
 def entropy_of(density, jitter=None):
     """The entropy of a ray from 1 to 2 whose bins have these densities."""
     bins = len(density)
@@ -109,7 +86,6 @@ def test_settings_that_cannot_be_are_refused_with_what_can():
     for settings, message in (
         ({"loss": "l2"}, "choose mse or l1"),
         ({"patch": 0}, "patch=0 must be at least 1"),
-        ({"tv_weight": -1.0}, "tv_weight=-1.0 must be at least 0"),
         ({"perceptual_weight": 0.1}, r"strategy.patch=1 is too small.*8 or more"),
     ):
         with pytest.raises(ConfigError, match=message):

@@ -93,7 +93,7 @@ class NGDModule(LightningModule):
     def on_train_start(self) -> None:
         self._start = self.field.snapshot()
         self._good = self._start
-        self._rendered: tuple[SceneImages, Float[Tensor, "scenes views height width"]] | None = None
+        self._rendered: SceneImages | None = None
         self._finite = torch.ones(len(self.field), dtype=torch.bool, device=self.device)
         self._finite_on_host = torch.ones(len(self.field), dtype=torch.bool, pin_memory=self.device.type == "cuda")
         self._fitted = self.cameras
@@ -122,10 +122,8 @@ class NGDModule(LightningModule):
     def training_step(self, step: int, batch_idx: int) -> None:
         self._choose_views(step)
         # render the field, for the teachers to guide by
-        follows = self.teachers[0].follows_field
         with timed("guide"):
-            seen, depth = self._render_guidance() if follows or self.objective.confidence.on else (None, None)
-            rendered = self._of_all_views(seen) if follows else None
+            rendered = self._render_guidance() if self.teachers[0].follows_field else None
         # ask the teachers for targets: the guided, denoised images
         made = [
             teacher.targets(step, None if rendered is None else rendered[scene])
@@ -140,7 +138,7 @@ class NGDModule(LightningModule):
         if stays:
             losses = targets.new_zeros(0, len(targets))
         else:
-            self._weigh(targets, depth)
+            self._weigh_views()
             losses = self._fit(targets)
         # record, and keep the last finite field
         first, last = (losses[0], losses[-1]) if len(losses) else (None, None)
@@ -224,20 +222,15 @@ class NGDModule(LightningModule):
             return chosen
         return with_views(chosen.new_zeros(*self.cameras.shape, *chosen.shape[2:]), self._chosen, chosen)
 
-    def _weigh(self, targets: SceneImages, depth: Float[Tensor, "scenes chosen height width"] | None) -> None:
-        """Set how much the pixels of the chosen views weigh, if any differ; the input view's weigh 1."""
-        weights = None
-        if self.objective.confidence.on:
-            weights = self.objective.confidence.weights(self._chosen_of(targets), depth, self._chosen_of(self.cameras))
-            weights = self._of_all_views(weights)
-        if self.teachers[0].view_weights is not None:
-            of_views = torch.stack([teacher.view_weights for teacher in self.teachers])[..., None, None]
-            weights = (torch.ones_like(targets[:, :, 0]) if weights is None else weights) * of_views
-        if weights is None:
+    def _weigh_views(self) -> None:
+        """Set how much views weigh, where a teacher says so; the input view weighs 1."""
+        if self.teachers[0].view_weights is None:
             return
+        weights = torch.stack([teacher.view_weights for teacher in self.teachers])
         if self.settings.fit_source:
             weights = torch.cat([weights, torch.ones_like(weights[:, :1])], 1)
-        self._batches.set_weights(weights)
+        size = self._source.shape[-2:]
+        self._batches.set_weights(weights[..., None, None].expand(*weights.shape, *size))
 
     @timed("fit")
     def _fit(self, targets: SceneImages) -> Float[Tensor, "steps scenes"]:
@@ -271,9 +264,9 @@ class NGDModule(LightningModule):
         self._last_targets = torch.where(keep, targets, self._last_targets)
         self._good = choose(self._finite, self.field.snapshot(), self._good)
 
-    def _render_guidance(self) -> tuple[SceneImages, Float[Tensor, "scenes views height width"]]:
-        """Render the chosen views, unless the field and they are those that were rendered last; return images and
-        depths. Where coarse weights are kept, the input view is rendered too if fitted."""
+    def _render_guidance(self) -> SceneImages:
+        """Render the chosen views, unless the field and they are those that were rendered last; zeros for the others.
+        Where coarse weights are kept, the input view is rendered too if fitted."""
         if self._rendered is None:
             cameras = self._fitted if self.keeps_coarse else self.cameras
             cameras = self._chosen_of(cameras, fitted=self.keeps_coarse)
@@ -281,7 +274,7 @@ class NGDModule(LightningModule):
             if rendering.coarse is not None:
                 self._batches.set_coarse(rendering.coarse.repeat_interleave(self._split, -1) / self._split)
             views = self.cameras.shape[1] if self._chosen is None else self._chosen.shape[1]
-            self._rendered = rendering.images[:, :views], rendering.depth[:, :views]
+            self._rendered = self._of_all_views(rendering.images[:, :views])
         return self._rendered
 
     @property

@@ -1,7 +1,7 @@
 """What a field is fitted for: the loss of its rays against the colours they should have, and regularisers."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -10,7 +10,6 @@ from torch import Tensor
 
 from nerfdiff.cameras import Rays
 from nerfdiff.field.field import Field, TriplaneField
-from nerfdiff.fit.confidence import Confidence
 from nerfdiff.fit.perceptual import LEAST, STAlex
 from nerfdiff.render.renderer import Renderer
 from nerfdiff.render.sampling import compositing_weights, edges_between, in_bins, uniform_edges
@@ -30,8 +29,6 @@ class Objective:
         loss: of colours: `mse` or `l1`.
         perceptual_weight: of ST-LPIPS on AlexNet over patches (`STAlex`).
         entropy_weight: of `ray_entropy`.
-        tv_weight: of `total_variation`.
-        confidence: how much less pixels weigh on which neighbouring views disagree.
 
     Raises:
         ConfigError: another loss, a negative weight, no patch, or a perceptual loss of patches too small for it.
@@ -41,15 +38,13 @@ class Objective:
     loss: str = "mse"
     perceptual_weight: float = 0.0
     entropy_weight: float = 0.0
-    tv_weight: float = 0.0
-    confidence: Confidence = field(default_factory=Confidence)
 
     def __post_init__(self):
         if self.loss not in LOSSES:
             raise ConfigError(f"strategy.loss={self.loss!r}: choose {' or '.join(LOSSES)}")
         if self.patch < 1:
             raise ConfigError(f"strategy.patch={self.patch} must be at least 1, which is scattered rays")
-        for name in ("perceptual_weight", "entropy_weight", "tv_weight"):
+        for name in ("perceptual_weight", "entropy_weight"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"strategy.{name}={getattr(self, name)} must be at least 0")
         if self.perceptual_weight > 0 and self.patch < 8:
@@ -126,8 +121,6 @@ class FitLoss:
     ) -> Float[Tensor, "scenes"]:
         """Add the regularisers to each scene's loss."""
         settings = self.objective
-        if settings.tv_weight > 0:
-            losses = losses + settings.tv_weight * total_variation(field.triplane.planes)
         if settings.entropy_weight > 0:
             some = Rays(*(values[:, ::ENTROPY_SHARE] for values in vars(rays).values()))
             uniform = jitter[:, ::ENTROPY_SHARE, : renderer.uniform_samples]
@@ -142,11 +135,6 @@ class FitLoss:
     def _as_patches(self, values: Float[Tensor, "scenes n 3"]) -> Float[Tensor, "patches 3 side side"]:
         side = self.objective.patch
         return values.reshape(-1, side, side, 3).movedim(-1, 1)
-
-
-def total_variation(planes: Float[Tensor, "scenes 3 channels height width"]) -> Float[Tensor, "scenes"]:
-    """Return the mean squared difference of neighbouring texels, down plus across."""
-    return sum(planes.diff(dim=axis).square().flatten(1).mean(1) for axis in (-2, -1) if planes.shape[axis] > 1)
 
 
 def ray_entropy(field: Field, rays: Rays, jitter: Float[Tensor, "scenes n samples"]) -> Float[Tensor, "scenes n"]:

@@ -9,7 +9,7 @@ from hydra.utils import instantiate
 from PIL import Image
 
 from nerfdiff.cli import load_config
-from nerfdiff.data.cutout import CutOut, write_mask
+from nerfdiff.data.cutout import CutOut, _doubts, write_mask
 from nerfdiff.inputs import ASSETS
 from nerfdiff.utils.errors import ConfigError, DataError
 from photographs import noise, photograph
@@ -65,12 +65,21 @@ def test_a_photograph_of_nothing_is_refused_and_says_what_to_give(tmp_path):
         cut_out().find(tmp_path / "grey.png")
 
 
-def test_a_cropped_object_is_doubted(tmp_path):
+def test_masks_that_may_be_wrong_are_doubted():
+    where = np.zeros((100, 100), bool)
+    where[40:60, 40:] = True
+    assert [doubt.split(" ")[1] for doubt in _doubts("a.png", where)] == ["touches"]
+    where[:] = False
+    where[50:60, 50:60] = True
+    assert _doubts("a.png", where) == ("it covers only 1.0% of the picture",)
+
+
+def test_an_object_that_the_border_cuts_is_refused(tmp_path):
     pixels = (noise((120, 160), 1) * 255).astype(np.uint8)
     pixels[30:90, 80:] = (200, 20, 30)
     Image.fromarray(pixels).save(tmp_path / "half.png")
-    found = cut_out().find(tmp_path / "half.png")
-    assert any("touches" in doubt for doubt in found.doubts)
+    with pytest.raises(DataError, match=r"half\.png: no object stands out"):
+        cut_out().find(tmp_path / "half.png")
 
 
 def test_the_mask_is_shown_and_can_be_given_back(tmp_path):

@@ -23,6 +23,7 @@ from nerfdiff.evaluation.run import EvaluationRun, choose_device, dataset_run, p
 from nerfdiff.processes import end_launched, lost_process, watch
 from nerfdiff.results.row import ResultRow
 from nerfdiff.stopping import Stopped
+from nerfdiff.stress.stress import with_stress
 from nerfdiff.utils.config import plain
 from nerfdiff.utils.errors import ConfigError, ProcessLost
 
@@ -45,9 +46,10 @@ def distill(cfg: DictConfig) -> ResultRow | None:
     """
     run, strategy = None, None
     try:
+        cfg = with_stress(cfg, "distill")
         fabric = _launch(cfg)
         run = picture_run(cfg, fabric.device) if cfg.image else dataset_run(cfg, fabric.device)
-        strategy, scorer = _strategy(cfg), None if cfg.image else instantiate(cfg.metrics)
+        strategy, scorer = run.stressed(_strategy(cfg)), None if cfg.image else instantiate(cfg.metrics)
         _predict_together(fabric, run, strategy)
         if fabric.global_rank > 0:
             return None

@@ -16,15 +16,17 @@ from nerfdiff.compilation import compile_unets
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.diffusion.layout import channels_last
+from nerfdiff.distill.strategy import Strategy
 from nerfdiff.model import NerfDiff
 from nerfdiff.results.environment import hardware
+from nerfdiff.stress.stress import Stress, stress_of
 from nerfdiff.utils.config import auto_precision, plain
 from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.hashes import sha256_file, sha256_values
 
 log = logging.getLogger(__name__)
 
-PRECISIONS = ("32-true", "bf16-mixed")
+PRECISIONS = {"32-true": None, "bf16-mixed": torch.bfloat16, "16-mixed": torch.float16}
 SAMPLES = ("uniform_samples", "importance_samples")
 
 
@@ -57,6 +59,7 @@ class RunSettings:
         minutes: after which no scene begins.
         progress_every: seconds between lines where there is no terminal.
         per_scene: leave every scene's field, trace and orbit beside its views.
+        stress, severity: what goes wrong on purpose, and by how much; None: nothing.
     """
 
     run_name: str
@@ -71,10 +74,13 @@ class RunSettings:
     per_scene: bool
     orbit: Orbit
     sheet: Sheet
+    stress: str | None
+    severity: float | None
 
     @staticmethod
     def of(cfg: DictConfig) -> "RunSettings":
         """Read the settings of a composed config."""
+        stress = stress_of(cfg)
         same = ("run_name", "seed", "scenes_at_once", "minutes", "progress_every", "per_scene")
         return RunSettings(
             **{name: cfg[name] for name in same},
@@ -84,6 +90,8 @@ class RunSettings:
             compiled=cfg.compile != "none",
             orbit=instantiate(cfg.orbit),
             sheet=instantiate(cfg.sheet),
+            stress=stress and stress.axis,
+            severity=None if stress is None else float(stress.severity),
         )
 
 
@@ -100,6 +108,7 @@ class EvaluationRun:
             threads, scenes at once, the renderer's chunks and the memory layout.
         rows_before: bytes of the file of results before this run.
         data: where the scenes come from; None for a picture, whose other views nobody knows.
+        stress: of the scenes, whose input `load` gives with it, and of the strategy; None: none.
     """
 
     settings: RunSettings
@@ -114,17 +123,22 @@ class EvaluationRun:
     cost_key: str
     rows_before: int
     data: SceneDataModule | None
+    stress: Stress | None
 
     @property
     def predictions(self) -> Path:
         return self.folder / "predictions"
 
+    def stressed(self, strategy: Strategy) -> Strategy:
+        """Return the strategy with this run's stress, where it acts on virtual views or targets."""
+        return strategy if self.stress is None else self.stress.strategy(strategy, self.load, self.scene_ids)
+
     def autocast(self) -> AbstractContextManager:
-        """Compute products in bf16 where the precision asks for it."""
-        if self.precision == "32-true":
+        """Compute products in halves where the precision asks for it."""
+        if (halves := PRECISIONS[self.precision]) is None:
             return nullcontext()
-        # Without the cache: it would keep the first bf16 copy of parameters that a strategy fits.
-        return torch.autocast(self.device.type, torch.bfloat16, cache_enabled=False)
+        # Without the cache: it would keep the first half copy of parameters that a strategy fits.
+        return torch.autocast(self.device.type, halves, cache_enabled=False)
 
 
 def choose_device(name: str) -> torch.device:
@@ -168,6 +182,8 @@ def dataset_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
     datamodule.setup("test")
     reader = datamodule.reader("test")
     scene_ids = [reader.scene_id(index) for index in datamodule.test_set.indices]
+    if (stress := stress_of(cfg)) is not None:
+        stress.inputs(datamodule.test_set)
     position = {name: index for index, name in enumerate(scene_ids)}
 
     def load(names: Sequence[str]) -> Iterable[ViewBatch]:
@@ -188,7 +204,7 @@ def dataset_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
         "image_size": size,
         "mean_image_scenes": cfg.get("mean_image_scenes"),  # a baseline of evaluate.py
     }
-    return _run(cfg, device, loaded, load, scene_ids, facts, datamodule)
+    return _run(cfg, device, loaded, load, scene_ids, facts, datamodule, stress)
 
 
 def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
@@ -201,6 +217,8 @@ def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
     size = loaded.image_size or plain(cfg.picture_size)
     if size is None:
         raise ConfigError(f"{loaded.path} does not say what image size it is for: give picture_size=[height,width]")
+    if (stress := stress_of(cfg)) is not None and stress.input_view is not None:
+        raise ConfigError(f"stress={stress.axis} chooses another input view, and a picture has none")
     picture = instantiate(cfg.picture)
     scene = picture.load(cfg.image, tuple(size))
     cameras = instantiate(cfg.picture_views)(scene)
@@ -214,7 +232,7 @@ def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
         "picture_views": plain(cfg.picture_views),
         "image_size": list(size),
     }
-    return _run(cfg, device, loaded, lambda names: [scene] * len(names), list(scene.scene_ids), facts, None)
+    return _run(cfg, device, loaded, lambda names: [scene] * len(names), list(scene.scene_ids), facts, None, stress)
 
 
 def _run(
@@ -225,23 +243,28 @@ def _run(
     scene_ids: list[str],
     facts: dict[str, Any],
     data: SceneDataModule | None,
+    stress: Stress | None,
 ) -> EvaluationRun:
     precision = cfg.precision if cfg.precision != "auto" else auto_precision(device.type)
     if precision not in PRECISIONS:
-        raise ConfigError(f"precision must be auto, {' or '.join(PRECISIONS)}, got {precision!r}")
-    identity = facts | {
-        "ckpt_sha256": sha256_file(loaded.path),
-        "weights": loaded.weights,
-        "seed": cfg.seed,
-        "precision": precision,
-        "kernel_precision": cfg.kernel_precision,
-        "backend": cfg.backend,
-        "compile": cfg.compile,
-        "samples": {name: getattr(loaded.model.renderer, name) for name in SAMPLES},
-        "device": device.type,  # whose generators draw the noise
-        "orbit": cfg.per_scene and cfg.orbit.frames,
-        "strategy": plain(cfg.strategy),
-    }
+        raise ConfigError(f"precision must be auto, {', '.join(PRECISIONS)}, got {precision!r}")
+    identity = (
+        facts
+        | {
+            "ckpt_sha256": sha256_file(loaded.path),
+            "weights": loaded.weights,
+            "seed": cfg.seed,
+            "precision": precision,
+            "kernel_precision": cfg.kernel_precision,
+            "backend": cfg.backend,
+            "compile": cfg.compile,
+            "samples": {name: getattr(loaded.model.renderer, name) for name in SAMPLES},
+            "device": device.type,  # whose generators draw the noise
+            "orbit": cfg.per_scene and cfg.orbit.frames,
+            "strategy": plain(cfg.strategy),
+        }
+        | (stress.identity if stress is not None else {})
+    )
     folder = Path(cfg.paths.output_dir) / f"{cfg.strategy.name}-{sha256_values(identity)[:8]}"
     model = loaded.model.to(device).requires_grad_(False)
     in_pixels = channels_last(cfg.channels_last, device, cfg.compile != "none")
@@ -253,7 +276,7 @@ def _run(
     return EvaluationRun(
         settings=settings,
         model=model,
-        load=load,
+        load=load if stress is None else stress.on(load),
         scene_ids=scene_ids,
         device=device,
         precision=precision,
@@ -263,4 +286,5 @@ def _run(
         cost_key=sha256_values(spent_on)[:8],
         rows_before=settings.results.stat().st_size if settings.results.is_file() else 0,
         data=data,
+        stress=stress,
     )

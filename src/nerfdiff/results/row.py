@@ -73,6 +73,8 @@ class _Identity:
     backend: str | None = None
     compile: bool | None = None
     scenes_at_once: int | None = None
+    stress: str | None = None
+    severity: float | None = None
 
 
 _WITHOUT_BLANK = [f"{metric.name}_without_blank" for metric in PACKAGE if metric.compared]
@@ -83,6 +85,7 @@ _NUMBERS = [(name, float | None, None) for name in (*(metric.name for metric in 
 class ResultRow(make_dataclass("_Measured", _NUMBERS, bases=(_Identity,), kw_only=True, slots=True)):
     """One measured run. None means not measured or not applicable.
 
+    `stress` is what went wrong on purpose, `severity` by how much in its own unit (conf/stress).
     `folder` is where predictions and scores lie, relative to the file of results. `command` makes the row again.
     Timings are dicts {n, median, iqr} in seconds, see `timing`: `encode_s` per image, `render_s` per view (of all
     predicted views of a scene in one call), the others per scene. `scene_s` is a scene from its input image to all its

@@ -18,7 +18,7 @@ from nerfdiff.evaluation.dashboard import show_in_dashboard
 from nerfdiff.evaluation.evaluate import show
 from nerfdiff.evaluation.measure import measure, record_failure
 from nerfdiff.evaluation.pictures import sheet
-from nerfdiff.evaluation.predict import done, predict, require_all
+from nerfdiff.evaluation.predict import costs, done, predict, require_all
 from nerfdiff.evaluation.run import EvaluationRun, choose_device, dataset_run, picture_run
 from nerfdiff.processes import end_launched, lost_process, watch
 from nerfdiff.results.row import ResultRow
@@ -71,6 +71,8 @@ def distill(cfg: DictConfig) -> ResultRow | None:
     if row is not None:
         show_in_dashboard(cfg, [row], pictures)
         show([row], run.folder / "table.md")
+    if cfg.image:
+        log.info("verdict: %s", costs(run, strategy)[0]["verdict"])
     log.info("fields, traces and orbits: %s", run.predictions / strategy.name)
     return row
 

@@ -19,6 +19,8 @@ from nerfdiff.diffusion.layout import channels_last
 from nerfdiff.distill.strategy import Strategy
 from nerfdiff.model import NerfDiff
 from nerfdiff.results.environment import hardware
+from nerfdiff.stability.familiar import FAMILIAR, Familiar
+from nerfdiff.stability.judge import Judge
 from nerfdiff.stress.stress import Stress, stress_of
 from nerfdiff.utils.config import auto_precision, plain
 from nerfdiff.utils.errors import ConfigError
@@ -59,7 +61,7 @@ class RunSettings:
         minutes: after which no scene begins.
         progress_every: seconds between lines where there is no terminal.
         per_scene: leave every scene's field, trace and orbit beside its views.
-        stress, severity: what goes wrong on purpose, and by how much; None: nothing.
+        stress, severity, neutral: what goes wrong on purpose, by how much, and how much is nothing; None: nothing.
     """
 
     run_name: str
@@ -76,6 +78,7 @@ class RunSettings:
     sheet: Sheet
     stress: str | None
     severity: float | None
+    neutral: float | None
 
     @staticmethod
     def of(cfg: DictConfig) -> "RunSettings":
@@ -92,6 +95,7 @@ class RunSettings:
             sheet=instantiate(cfg.sheet),
             stress=stress and stress.axis,
             severity=None if stress is None else float(stress.severity),
+            neutral=None if stress is None or stress.neutral is None else float(stress.neutral),
         )
 
 
@@ -108,6 +112,8 @@ class EvaluationRun:
             threads, scenes at once, the renderer's chunks and the memory layout.
         rows_before: bytes of the file of results before this run.
         data: where the scenes come from; None for a picture, whose other views nobody knows.
+        judge: says of every scene whether its views can be trusted; None: nothing does.
+        familiar: what the judge knows of the model's training images; None: nothing.
         stress: of the scenes, whose input `load` gives with it, and of the strategy; None: none.
     """
 
@@ -123,6 +129,8 @@ class EvaluationRun:
     cost_key: str
     rows_before: int
     data: SceneDataModule | None
+    judge: Judge | None
+    familiar: Familiar | None
     stress: Stress | None
 
     @property
@@ -273,6 +281,7 @@ def _run(
     compile_unets(model, cfg.compile, cfg.paths.compiled_dir)
     spent_on = [hardware(device), cfg.threads, cfg.scenes_at_once, model.renderer.chunk, in_pixels]
     settings = RunSettings.of(cfg)
+    familiar = loaded.path.parent / FAMILIAR
     return EvaluationRun(
         settings=settings,
         model=model,
@@ -286,5 +295,7 @@ def _run(
         cost_key=sha256_values(spent_on)[:8],
         rows_before=settings.results.stat().st_size if settings.results.is_file() else 0,
         data=data,
+        judge=instantiate(cfg.judge),
+        familiar=Familiar.load(familiar) if familiar.is_file() else None,
         stress=stress,
     )

@@ -38,6 +38,7 @@ class Stress:
         axis: its name.
         severity: in the axis's own unit.
         seed: of what it draws.
+        neutral: the severity that is none; None where every one is some.
         image: acts on the input image.
         scene: acts on a scene's input camera and bounds.
         prior: acts on the virtual views' cameras.
@@ -49,6 +50,7 @@ class Stress:
     axis: str
     severity: float
     seed: int
+    neutral: float | None = None
     image: Callable | None = None
     scene: Callable | None = None
     prior: Callable | None = None
@@ -171,7 +173,7 @@ def stress_of(cfg: DictConfig) -> Stress | None:
         return None
     functions = {name: stress[name] for name in FUNCTIONS if stress[name] is not None}
     built = {name: node if isinstance(node, bool) else instantiate(node) for name, node in functions.items()}
-    return Stress(stress.axis, stress.severity, cfg.seed, **built)
+    return Stress(stress.axis, stress.severity, cfg.seed, stress.neutral, **built)
 
 
 def with_stress(cfg: DictConfig, command: str) -> DictConfig:

@@ -131,6 +131,6 @@ def limits_text(limits: Limits, fitted_on: Sequence[Sample], tested_on: Sequence
         recall, alarms = rates(limits, samples)
         broken = sum(sample.broken for sample in samples)
         lines.append(
-            f"# {name} on {len(samples)} scenes, {broken} of them broken: recall {recall:.0%}, false alarms {alarms:.0%}"
+            f"# {name} on {len(samples)} scenes, {broken} broken: recall {recall:.0%}, false alarms {alarms:.0%}"
         )
     return "\n".join(lines)

@@ -21,7 +21,7 @@ from nerfdiff.stability.breaking import (
 )
 from nerfdiff.stability.study import studies
 from nerfdiff.stability.text import severity_text, to_markdown, training_markdown
-from nerfdiff.sweeps.stress_space import stress_files
+from nerfdiff.stress.axes import stress_files
 
 RULES = Rules(failed=0.1, clean=3.0, harm=0.5, frechet=2.0)
 BOOTSTRAP = Bootstrap(resamples=200, level=0.95, seed=0)

@@ -6,7 +6,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from nerfdiff.cli import load_config
-from nerfdiff.sweeps.stress_space import StressSpace, acts, severities_of, stress_files
+from nerfdiff.stress.axes import stress_files
+from nerfdiff.sweeps.stress_space import StressSpace, acts, severities_of
 from nerfdiff.utils.errors import ConfigError
 
 CONFIGS = {}

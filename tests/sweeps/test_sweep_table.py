@@ -288,7 +288,7 @@ def test_what_rows_say_is_text_everywhere(swept, tmp_path):
 
 
 def table(frontier=None, pause=0.0):
-    return SweepTable(["strategy"], {"strategy": "none"}, {}, [], BOOTSTRAP, frontier, pause)
+    return SweepTable(["strategy"], {"strategy": "none"}, {}, [], BOOTSTRAP, frontier, pause, True)
 
 
 def test_a_failure_that_no_row_tells_of_becomes_one(tmp_path, monkeypatch):

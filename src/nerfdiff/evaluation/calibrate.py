@@ -38,7 +38,7 @@ def calibrate(cfg: DictConfig) -> None:
 def _controls(cfg: DictConfig) -> None:
     data = instantiate(cfg.data)
     data.setup("test")
-    found = controls(data.test_set, instantiate(cfg.metrics), cfg.scenes, cfg.alien_share, cfg.blur, cfg.seed)
+    found = controls(data.test_set, instantiate(cfg.metrics), cfg.first_scenes, cfg.alien_share, cfg.blur, cfg.seed)
     text = controls_markdown(found)
     if cfg.out is not None:
         write_text(Path(cfg.out), text)

@@ -1,7 +1,7 @@
 """The metrics, each with all that rows, tables, dashboards and the chart say of it."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -9,6 +9,7 @@ from nerfdiff.utils.errors import ConfigError
 
 ARROWS = {"higher": " ↑", "lower": " ↓", "one": " (1)", None: ""}
 PER = ("image", "scene", "run")
+MARK = " †"
 LONGEST = 60  # letters of a label or unit
 
 
@@ -26,6 +27,7 @@ class Metric:
         within: distance from the best at which the chart's advice begins; None leaves the metric out of the chart.
         compared: sweeps show differences to their reference and the frontier for it, and blank scenes are told apart.
         detail: TensorBoard shows it among the details.
+        rewards: what failure it rewards (docs/stability.md); None where none is known.
         measure: of your own metric: images [n, 3, h, w] in [0, 1], predicted and true, to values [n].
 
     Raises:
@@ -41,6 +43,7 @@ class Metric:
     within: float | None = None
     compared: bool = False
     detail: bool = False
+    rewards: str | None = None
     measure: Callable[..., Any] | None = field(default=None, compare=False)
 
     def __post_init__(self):
@@ -62,8 +65,8 @@ class Metric:
 
     @property
     def heading(self) -> str:
-        """The label with an arrow to where it is better."""
-        return f"{self.label}{ARROWS[self.better]}"
+        """The label, a mark where the metric rewards a failure, and an arrow to where it is better."""
+        return f"{self.label}{MARK if self.rewards else ''}{ARROWS[self.better]}"
 
     @property
     def format(self) -> str:
@@ -140,3 +143,14 @@ def own(settings: Mapping[str, Mapping[str, Any]]) -> list[Metric]:
 def named(*per: str) -> list[str]:
     """Names of the metrics of which an image, a scene or a run has a value."""
     return [metric.name for metric in METRICS.values() if metric.per in per]
+
+
+def reward_note(headings: Iterable[str]) -> str | None:
+    """Return words on those metrics under `headings` that reward a failure; None where none does."""
+    shown = tuple(headings)
+    told = [
+        f"{metric.label} rewards {metric.rewards}"
+        for metric in METRICS.values()
+        if metric.rewards and any(metric.heading in heading for heading in shown)
+    ]
+    return f"†: {'; '.join(told)}. Read it beside the others." if told else None

@@ -65,12 +65,14 @@ class Study:
         settings: the overrides in which they agree.
         clean: mean PSNR without stress, by strategy.
         axes: the stresses, as configs, by name.
+        clean_runs: those without stress, by strategy.
     """
 
     settings: tuple[str, ...]
     verdicts: tuple[Verdict, ...]
     clean: Mapping[str, float]
     axes: Mapping[str, DictConfig] = field(default_factory=dict)
+    clean_runs: Mapping[str, Sequence[Run]] = field(default_factory=dict)
 
     @property
     def silent(self) -> int:
@@ -152,7 +154,7 @@ def _study(
         for strategy, own in clean.items()
         if own and all(math.isfinite(o.psnr) for o in own.values())
     }
-    return Study(settings, tuple(verdicts), means, axes)
+    return Study(settings, tuple(verdicts), means, axes, clean_runs)
 
 
 def _in_order(stress: DictConfig, found: Iterable[float]) -> list[float]:

@@ -13,8 +13,8 @@ from nerfdiff.results.intervals import Bootstrap
 from nerfdiff.stability.breaking import Rules
 from nerfdiff.stability.study import studies
 from nerfdiff.stability.text import to_markdown, training_markdown
+from nerfdiff.stress.axes import stress_files
 from nerfdiff.sweeps.jobs import jobs_of, results_of
-from nerfdiff.sweeps.stress_space import stress_files
 from nerfdiff.utils.errors import UserError
 from nerfdiff.utils.files import write_text
 

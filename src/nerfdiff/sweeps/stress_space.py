@@ -7,21 +7,12 @@ from itertools import zip_longest
 
 from omegaconf import DictConfig, OmegaConf
 
-from nerfdiff.inputs import CONF
 from nerfdiff.stability.breaking import sides_of
+from nerfdiff.stress.axes import NONE, stress_files
 from nerfdiff.sweeps.space import SEED, Axis, Space, axes_of
 from nerfdiff.utils.errors import ConfigError
 
 log = logging.getLogger(__name__)
-
-NONE = "none"
-
-
-def stress_files() -> dict[str, DictConfig]:
-    """Return every stress of `conf/stress` by its axis, interpolations unresolved."""
-    common = OmegaConf.load(CONF / "common" / "stress.yaml")
-    found = {path.stem: OmegaConf.merge(common, OmegaConf.load(path)) for path in (CONF / "stress").glob("*.yaml")}
-    return {axis: found[axis] for axis in sorted(found) if axis != NONE}
 
 
 @dataclass(frozen=True)

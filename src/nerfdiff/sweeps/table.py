@@ -49,8 +49,8 @@ class SweepTable(Callback):
         paper: Sequence[Mapping[str, Any]],
         bootstrap: Bootstrap,
         frontier: Frontier | None,
-        show: bool,
         pause: float,
+        show: bool,
     ):
         self.labels, self.reference, self.goal = labels, reference, goal
         self.paper, self.bootstrap, self.frontier, self.pause = paper, bootstrap, frontier, pause

@@ -139,7 +139,7 @@ def test_colours_are_told_apart_by_their_lightness_alone_and_words_are_legible_o
     light = [luminance(colour) for colour in scale]
     assert light == sorted(light) and all(b - a > 0.03 for a, b in pairwise(light))
     for at, back in enumerate(light):  # WCAG: 4.5, for what stands on them
-        ink = 1.0 if at / len(light) < 0.5 else luminance("#1d2430")
+        ink = 1.0 if at / len(light) < 0.6 else luminance("#1d2430")
         high, low = max(ink, back), min(ink, back)
         assert (high + 0.05) / (low + 0.05) > 3.9, scale[at]
 

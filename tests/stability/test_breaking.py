@@ -182,13 +182,15 @@ def test_rows_of_a_sweep_give_the_verdicts_that_they_are_made_for(sweep):
 
 
 def test_verdicts_are_written_as_tables_in_the_axis_own_units(sweep):
-    text = to_markdown(studies(sweep, stress_files(), RULES, BOOTSTRAP), ["stress=halo stress.severity=4"])
+    text = to_markdown(
+        studies(sweep, stress_files(), RULES, BOOTSTRAP), ["stress=halo stress.severity=4"], ["elevation: -10°"]
+    )
     assert "**Silent failures: 2 of 6 broken scenes.**" in text
     assert (
         "| focal length | > ×0.7 true / ×2 true [×2 true, ×2 true] (b) | ×0.7 true [×0.7 true, ×0.7 true] (a) /" in text
     )
     assert "| focal length | ngd | ×0.7 true | – | – | – | 2 of 2 | 0 | a | 0 | – |" in text
-    assert "Not run: 1 jobs, the first stress=halo" in text and "Left out of elevation: -10°" in text
+    assert "Not run: 1 jobs, the first stress=halo" in text and "Left out: elevation: -10°." in text
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,8 @@ def test_every_axis_is_there_with_its_severities_and_the_strategies_it_acts_on()
     for job in jobs:
         words = dict(word.split("=", 1) for word in job)
         by_axis.setdefault(words["stress"], []).append((words.get("stress.severity"), words["strategy"]))
-    axes = {axis: stress for axis, stress in stress_files().items() if stress.where == "distill" and stress.quick}
+    missing = {"shape", "prior_training"}  # which need folders
+    axes = {axis for axis, stress in stress_files().items() if stress.where == "distill" and axis not in missing}
     assert set(by_axis) == {"none", *axes} and len(set(jobs)) == len(jobs)
     assert [strategy for _, strategy in by_axis["none"]] == [
         "none",
@@ -99,7 +100,20 @@ def test_what_the_sweep_cannot_sweep_over_is_refused(words, message):
     ],
 )
 def test_severities_go_from_the_harshest_of_either_side_inwards_without_the_neutral_one(axis, severities):
-    assert severities_of(stress_files()[axis], compose(["strategy=ngd_current"]), "severities") == severities
+    found = severities_of(stress_files()[axis], compose(["strategy=ngd_current"]), "severities")
+    assert found == (severities, {})
+
+
+def test_an_axis_whose_folder_is_there_runs_with_baselines_of_its_own_scenes_and_else_is_left_out(tmp_path, caplog):
+    config = compose(["strategy=ngd_current"]).copy()
+    config.paths.kaykit_dir = str(tmp_path)
+    found, missing = severities_of(stress_files()["shape"], config, "quick")
+    assert found == [1] and missing == {2: "data/procedural/chairs_64"}
+    caplog.set_level("INFO")
+    made = StressSpace("distill", "quick", ["copy_input"])(["strategy=ngd"], ["stress=shape"], lambda words: config)
+    jobs = [dict(word.split("=", 1) for word in job) for job in made]
+    assert [job["strategy"] for job in jobs if job["stress"] == "shape"] == ["ngd", "copy_input"]
+    assert "left out: shape at 2: there is no data/procedural/chairs_64" in caplog.text
 
 
 def test_training_has_its_own_stresses_and_no_strategies():

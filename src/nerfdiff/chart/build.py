@@ -108,7 +108,7 @@ def build_chart(cfg: DictConfig) -> Path:
     write_csv(out / "configurations.csv", configuration_columns(), map(configuration_line, content.found))
     write_csv(out / "runs.csv", list(dict.fromkeys(("results", *COLUMNS, *METRICS))), run_lines(found.runs))
     pictures = _pngs(cfg, out, content, published)
-    counts = f"{len(found.runs)} runs, {len(content.found)} configurations, {len(failed)} failed runs"
+    counts = f"{len(found.runs)} runs, {len(content.found)} configurations, {len(failures(found.runs))} failed runs"
     write_page(
         page,
         cfg.title,

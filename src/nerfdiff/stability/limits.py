@@ -11,6 +11,7 @@ from nerfdiff.metrics.predictions import SCENE
 from nerfdiff.results.frame import Run
 from nerfdiff.stability.breaking import Rules
 from nerfdiff.stability.study import read_scenes
+from nerfdiff.stress.axes import stress_files
 from nerfdiff.utils.hashes import sha256_values
 
 LEAST, MOST = "least", "most"
@@ -108,7 +109,10 @@ def samples_of(runs: Sequence[Run], rules: Rules) -> list[Sample]:
             for scene, outcome in read_scenes(run).items():
                 clean[run.row.strategy, run.row.seed, scene] = outcome.psnr
     found = []
+    axes = stress_files()
     for run in runs:
+        if run.row.stress in axes and axes[run.row.stress].own_scenes:
+            continue  # of these there is nothing clean to compare with
         for scene, outcome in read_scenes(run).items():
             path = run.file("predictions", str(run.row.strategy), scene, SCENE)
             signs = None if path is None else json.loads(path.read_text(encoding="utf-8")).get("signs")

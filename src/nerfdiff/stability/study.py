@@ -109,25 +109,26 @@ def _study(
     scenes = sorted({scene for own in clean_runs.values() for run in own for scene in read_scenes(run)})
     outcomes = {point: _outcomes(own, scenes) for point, own in by_point.items()}
     clean = {strategy: outcomes[CLEAN, None, strategy] for strategy in clean_runs}
-    baseline: dict[str, float] = {}
-    for name in BASELINES:
-        for (_, scene), outcome in clean.get(name, {}).items():
-            baseline[scene] = max(outcome.psnr, baseline.get(scene, -math.inf))
+    baseline = _better({name: clean.get(name, {}) for name in BASELINES})
     verdicts = []
     strategies = list(dict.fromkeys(strategy for _, _, strategy in by_point if strategy not in BASELINES))
     judged: dict[tuple[str, str], dict[float, Judged]] = {}
     for axis in dict.fromkeys(axis for axis, _, _ in by_point if axis in axes):
         for strategy in strategies:
             for severity in (s for a, s, of in by_point if (a, of) == (axis, strategy)):
-                none = outcomes.get((axis, severity, "none"), clean.get("none", {}))
+                others = axes[axis].own_scenes
+                own = _better({name: outcomes.get((axis, severity, name), {}) for name in BASELINES})
+                none = outcomes.get((axis, severity, "none"), {} if others else clean.get("none", {}))
                 judged.setdefault((axis, strategy), {})[severity] = Judged(
                     severity,
                     outcomes[axis, severity, strategy],
-                    clean.get(strategy, {}),
+                    {} if others else clean.get(strategy, {}),
                     {} if strategy == "none" else none,
-                    baseline,
+                    _better({name: outcomes.get((axis, severity, name), {}) for name in BASELINES})
+                    if others
+                    else baseline,
                     _frechet(by_point[axis, severity, strategy]),
-                    _frechet(clean_runs.get(strategy, ())),
+                    [] if others else _frechet(clean_runs.get(strategy, ())),
                 )
     points = {
         key: {severity: point_of(each, rules, bootstrap) for severity, each in own.items()}
@@ -155,6 +156,15 @@ def _study(
         if own and all(math.isfinite(o.psnr) for o in own.values())
     }
     return Study(settings, tuple(verdicts), means, axes, clean_runs)
+
+
+def _better(baselines: Mapping[str, Outcomes]) -> dict[str, float]:
+    """Return the PSNR of the baseline that is better on average, by scene."""
+    means = {
+        name: {scene: outcome.psnr for (_, scene), outcome in own.items() if math.isfinite(outcome.psnr)}
+        for name, own in baselines.items()
+    }
+    return max(means.values(), key=lambda own: sum(own.values()) / len(own) if own else -math.inf, default={})
 
 
 def _in_order(stress: DictConfig, found: Iterable[float]) -> list[float]:

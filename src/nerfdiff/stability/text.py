@@ -44,8 +44,13 @@ def breaking_text(stress: DictConfig, breaking: Breaking) -> str:
     return f"{text} [{low}, {high}] ({breaking.rules})"
 
 
-def to_markdown(found: Sequence[Study], left_out: Sequence[str] = ()) -> str:
-    """Breaking points by axis and strategy, then areas, means and what was left out."""
+def to_markdown(found: Sequence[Study], waiting: Sequence[str] = (), left_out: Sequence[str] = ()) -> str:
+    """Breaking points by axis and strategy, then areas and means.
+
+    Args:
+        waiting: jobs that were not run.
+        left_out: what the sweep leaves out, and why.
+    """
     parts = ["# Stability\n"]
     for study in found:
         strategies = list(dict.fromkeys(verdict.strategy for verdict in study.verdicts))
@@ -66,11 +71,9 @@ def to_markdown(found: Sequence[Study], left_out: Sequence[str] = ()) -> str:
             if any(value is not None for value in areas):
                 rows.append([study.axes[axis].name, *("–" if a is None else f"{a:.2f}" for a in areas)])
         parts += [markdown_lines(rows), "\n## Every severity\n", markdown_lines(_lines(study))]
-    if left_out:
-        parts.append(f"\nNot run: {len(left_out)} jobs, the first {left_out[0]}; the same command goes on.\n")
-    for axis, stress in (found[0].axes if found else {}).items():
-        if stress.left_out and stress.where == "distill":
-            parts.append(f"\nLeft out of {axis}: {stress.left_out}.\n")
+    if waiting:
+        parts.append(f"\nNot run: {len(waiting)} jobs, the first {waiting[0]}; the same command goes on.\n")
+    parts += [f"\nLeft out: {line}.\n" for line in left_out]
     return "\n".join(parts)
 
 

@@ -15,6 +15,7 @@ from nerfdiff.stability.study import studies
 from nerfdiff.stability.text import to_markdown, training_markdown
 from nerfdiff.stress.axes import stress_files
 from nerfdiff.sweeps.jobs import jobs_of, results_of
+from nerfdiff.sweeps.stress_space import severities_of
 from nerfdiff.utils.errors import UserError
 from nerfdiff.utils.files import write_text
 
@@ -40,13 +41,24 @@ class StabilityTable(Callback):
             jobs = jobs_of(config, results_of(config))
             runs = [Run(job.row, folder) for job in jobs if job.row is not None]
             found = studies(runs, stress_files(), self.rules, self.bootstrap)
-            left = [" ".join(job.overrides[:3]) for job in jobs if job.row is None]
-            write_text(folder / VERDICTS, to_markdown(found, left))
+            waiting = [" ".join(job.overrides[:3]) for job in jobs if job.row is None]
+            write_text(folder / VERDICTS, to_markdown(found, waiting, left_out(config)))
             for study in found:
                 log.info("silent failures: %d of %d broken scenes", study.silent, study.broken)
             log.info("verdicts: %s   page: python src/chart.py results=%s", folder / VERDICTS, folder)
         except UserError as error:
             log.error("the sweep's verdicts: %s", error)
+
+
+def left_out(config: DictConfig) -> list[str]:
+    """Say what a sweep leaves out: of the axes that it could do, severities without their folders, and all else."""
+    said = []
+    for axis, stress in stress_files().items():
+        if stress.where == "distill":
+            _, missing = severities_of(stress, config, "severities")
+            said += [f"{axis} at {severity:g}: there is no {folder}" for severity, folder in missing.items()]
+            said += [f"{axis}: {stress.left_out}"] if stress.left_out else []
+    return said
 
 
 class TrainingStability(Callback):

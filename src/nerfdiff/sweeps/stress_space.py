@@ -4,6 +4,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
+from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -64,10 +65,12 @@ class StressSpace:
         branches, left, columns = [branch(NONE, None, clean)], [], []
         for axis, stress in chosen.items():
             acted_on = [word for word, config in configs.items() if acts(stress, config)]
+            acted_on += [word for word in clean[len(strategies) :] if stress.own_scenes]
             if stress.left_out:
                 left.append(f"{axis}: {stress.left_out}")
             if acted_on:
-                several = severities_of(stress, next(iter(configs.values())), self.severities)
+                several, missing = severities_of(stress, next(iter(configs.values())), self.severities)
+                left += [f"{axis} at {severity:g}: there is no {folder}" for severity, folder in missing.items()]
                 columns.append([branch(axis, severity, [w for w in acted_on if w]) for severity in several])
         branches += [each for rank in zip_longest(*columns) for each in rank if each is not None]
         for line in left:
@@ -82,15 +85,21 @@ class StressSpace:
         return {name: known[name] for name in names}
 
 
-def severities_of(stress: DictConfig, config: DictConfig, key: str) -> list[float | int]:
-    """Return the severities of an axis, the harshest of either side first, without the neutral one of this config."""
+def severities_of(stress: DictConfig, config: DictConfig, key: str) -> tuple[list[float | int], dict[float | int, str]]:
+    """Return the severities of an axis, the harshest of either side first, without the neutral one of this config.
+
+    Those that lack a folder that they require are apart, with the folder.
+    """
     resolved = OmegaConf.create(OmegaConf.to_container(config, resolve=False))
     del resolved["hydra"]
     resolved.stress = stress
     neutral = resolved.stress.neutral
-    sides = sides_of([severity for severity in stress[key] if severity != neutral], neutral, stress.ordered)
+    required = {float(severity): str(folder) for severity, folder in resolved.stress.requires.items()}
+    missing = {s: required[s] for s in stress[key] if s in required and not Path(required[s]).is_dir()}
+    wanted = [severity for severity in stress[key] if severity != neutral and severity not in missing]
+    sides = sides_of(wanted, neutral, stress.ordered)
     ranks = zip_longest(*(reversed(side) for side in sides.values()))
-    return [severity for rank in ranks for severity in rank if severity is not None]
+    return [severity for rank in ranks for severity in rank if severity is not None], missing
 
 
 def acts(stress: DictConfig, config: DictConfig) -> bool:

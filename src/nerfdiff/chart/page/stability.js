@@ -4,7 +4,7 @@ const HEAT = ["#00204d", "#3b496c", "#7f7c75", "#bcaf6f", "#ffea46"];
 let study = null;
 
 const heatOf = (share) => HEAT[Math.min(HEAT.length - 1, Math.floor(share * HEAT.length))];
-const inkOf = (share) => (share < 0.5 ? "#fff" : "#1d2430");
+const inkOf = (share) => (share < 0.6 ? "#fff" : "#1d2430");
 
 function drawStability() {
   $("stability").hidden = !data.stability.length;
@@ -17,7 +17,7 @@ function drawStability() {
   $("heat-legend").replaceChildren("It breaks ", ...HEAT.flatMap((colour, at) => {
     const swatch = element("span", { className: "swatch" });
     swatch.style.background = colour;
-    return [swatch, shares[at]];
+    return [swatch, `${shares[at]} `];
   }));
   showStudy(0);
 }

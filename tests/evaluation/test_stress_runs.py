@@ -42,9 +42,9 @@ def rgb(out) -> list[bytes]:
 
 
 def test_rows_have_axis_and_severity_and_no_severity_is_no_stress_to_the_bit(data, run, tmp_path):
-    plain = distill(config(data, run, tmp_path / "plain", "strategy=ngd"))
-    neutral = distill(config(data, run, tmp_path / "neutral", "strategy=ngd", "stress=focal", "stress.severity=1.0"))
-    stressed = distill(config(data, run, tmp_path / "focal", "strategy=ngd", "stress=focal", "stress.severity=1.2"))
+    plain = distill(config(data, run, tmp_path / "plain", "strategy=none"))
+    neutral = distill(config(data, run, tmp_path / "neutral", "strategy=none", "stress=focal", "stress.severity=1.0"))
+    stressed = distill(config(data, run, tmp_path / "focal", "strategy=none", "stress=focal", "stress.severity=1.2"))
     assert (plain.stress, plain.severity) == (neutral.stress, neutral.severity) == (None, None)
     assert (stressed.stress, stressed.severity, stressed.neutral) == ("focal", 1.2, 1.0)
     assert plain.config_sha256 == neutral.config_sha256 != stressed.config_sha256
@@ -53,13 +53,11 @@ def test_rows_have_axis_and_severity_and_no_severity_is_no_stress_to_the_bit(dat
     assert (row.stress, row.severity, row.status) == ("focal", 1.2, "ok")
 
 
-@pytest.mark.parametrize("axis", ["alien_views", "pose_rotation", "views", "elevation", "noise"])
+@pytest.mark.parametrize("axis", ["alien_views", "elevation"])
 def test_every_kind_of_stress_reaches_a_strategy(axis, data, run, tmp_path):
-    """Of the prior, targets, settings, the input view and the image; the judge has said something of every scene."""
-    severity = {"elevation": None, "views": 1}.get(axis)
-    words = [f"stress.severity={severity}"] if severity else []
-    if axis == "elevation":  # the views of these scenes are anywhere
-        words = ["stress.severity=0", "stress.input_view.tolerance=90.0"]
+    """The targets, and the input view with its prior; the judge has said something of every scene."""
+    # the views of these scenes are anywhere
+    words = ["stress.severity=0", "stress.input_view.tolerance=90.0"] if axis == "elevation" else []
     row = distill(config(data, run, tmp_path, "strategy=direct", f"stress={axis}", *words))
     assert (row.stress, row.status, row.suspects is not None, row.verdict is not None) == (axis, "ok", True, True)
     assert (1 if axis == "views" else 2) == row.K
@@ -110,8 +108,8 @@ def test_a_models_training_images_are_learnt_and_other_parts_are_refused(data, r
             calibrate(load_config("calibrate", words))
 
 
-@pytest.mark.parametrize(("stress", "severity"), [("train_lr", 3.0), ("train_swapped_images", 0.2)])
-def test_a_training_run_leaves_a_row_of_how_it_went(stress, severity, data, tmp_path):
+def test_a_training_run_leaves_a_row_of_how_it_went(data, tmp_path):
+    stress, severity = "train_swapped_images", 0.2
     words = [f"stress={stress}", f"stress.severity={severity}", f"results={tmp_path / 'results.jsonl'}"]
     run_training(data, tmp_path / "run", "trainer.max_steps=3", "validation_every=3", *words)
     (row,) = read_rows(tmp_path / "results.jsonl")

@@ -13,8 +13,8 @@ from nerfdiff.distill.trace import Step
 from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.fit.saved_field import SavedField
 from nerfdiff.stability.familiar import Familiar, features
-from nerfdiff.stability.judge import SIGNS, Judge
-from nerfdiff.stability.limits import LEAST, MOST, Sample, fit_limits, halves, limits_text, rates, suspected
+from nerfdiff.stability.judge import ENDS, LEAST, MOST, SIGNS, Judge
+from nerfdiff.stability.limits import Sample, fit_limits, halves, limits_text, rates, suspected
 from nerfdiff.utils.errors import ConfigError, DataError
 
 SIZE = 16
@@ -93,6 +93,10 @@ def test_planted_failures_are_suspected_and_why_is_said(net, scene, views, kind,
     assert JUDGE.verdict(found).startswith("suspect: ") and said in JUDGE.verdict(found)
 
 
+def test_every_sign_has_an_end_at_which_it_is_bad():
+    assert set(ENDS) == set(SIGNS) and set().union(*ENDS.values()) == {LEAST, MOST}
+
+
 def test_a_fallback_a_wrong_input_view_and_a_sign_that_is_not_finite_are_suspected():
     sound = {"input_psnr": 30.0}
     assert JUDGE.verdict(sound, "diverged") == "suspect: it fell back (diverged)"
@@ -138,12 +142,12 @@ def samples(count: int, seed: int) -> list[Sample]:
 
 
 def test_limits_are_those_signs_that_tell_and_few_sound_scenes_are_suspected():
-    limits = fit_limits(samples(90, 0), false_alarms=0.05, steps=6)
+    limits = fit_limits(samples(90, 0), false_alarms=0.05, steps=6, margin=0.5)
     assert set(limits) == {("input_psnr", LEAST), ("haze", MOST)}
     assert rates(limits, samples(90, 1)) == (1.0, 0.0)
     assert suspected(limits, {"input_psnr": float("nan")}) and not suspected(limits, {})
     assert rates({}, samples(30, 0)) == (0.0, 0.0)
-    assert fit_limits([replace_broken(s) for s in samples(30, 0)], 0.05, 6) == {}
+    assert fit_limits([replace_broken(s) for s in samples(30, 0)], 0.05, 6, 0.5) == {}
 
 
 def replace_broken(sample: Sample) -> Sample:
@@ -154,7 +158,7 @@ def test_false_alarms_stay_within_their_share():
     """A sign that tells the broken from nothing is cut where 5 % of the sound are lost at most."""
     rng = np.random.default_rng(0)
     mixed = [Sample("a", "s", {"haze": rng.normal(0.3 if n % 2 else 0.0, 0.2)}, bool(n % 2)) for n in range(400)]
-    recall, alarms = rates(fit_limits(mixed, 0.05, 6), mixed)
+    recall, alarms = rates(fit_limits(mixed, 0.05, 6, 0.5), mixed)
     assert 0.2 < recall < 0.7 and alarms <= 0.05
 
 

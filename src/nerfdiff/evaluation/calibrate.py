@@ -68,5 +68,5 @@ def _judge(cfg: DictConfig) -> None:
     rules = instantiate(cfg.verdicts.rules)
     samples = samples_of(runs, rules)
     fitted_on, tested_on = halves(samples)
-    limits = fit_limits(fitted_on, cfg.false_alarms, cfg.steps)
+    limits = fit_limits(fitted_on, cfg.false_alarms, cfg.steps, cfg.margin)
     print(limits_text(limits, fitted_on, tested_on))

@@ -10,6 +10,7 @@ from nerfdiff.utils.errors import ConfigError
 ARROWS = {"higher": " ↑", "lower": " ↓", "one": " (1)", None: ""}
 PER = ("image", "scene", "run")
 MARK = " †"
+REPEATS = "one image repeated and views of other scenes"
 LONGEST = 60  # letters of a label or unit
 
 
@@ -95,16 +96,24 @@ METRICS = _table(
     Metric("ssim", "SSIM", within=0.005, compared=True),
     Metric("ssim_gaussian", "SSIM (Gaussian)"),
     Metric("lpips", "LPIPS", "lower", within=0.005, compared=True),
-    Metric("fid", "FID", "lower", digits=2, per="run", within=1.0),
+    Metric("fid", "FID", "lower", digits=2, per="run", within=1.0, rewards="views of other scenes"),
     Metric("st_lpips_vgg", "ST-LPIPS", "lower", within=0.005, compared=True),
-    Metric("fd_st_vgg", "FD ST-VGG", "lower", digits=2, per="run", within=5.0),
-    Metric("sharpness", "sharpness", "one", digits=2, detail=True),
+    Metric("fd_st_vgg", "FD ST-VGG", "lower", digits=2, per="run", within=5.0, rewards=REPEATS),
+    Metric("sharpness", "sharpness", "one", digits=2, detail=True, rewards="speckle on blur"),
     Metric("depth_abs_rel", "depth abs rel", "lower", within=0.002, detail=True),
     Metric("depth_rmse", "depth RMSE", "lower", detail=True),
     Metric("mask_iou", "mask IoU", detail=True),
     Metric("floaters", "floaters", "lower", per="scene", within=0.01, detail=True),
     Metric("depth_extent", "depth extent", "one", digits=2, per="scene", detail=True),
-    Metric("consistency_psnr", "consistency PSNR", unit="dB", digits=2, per="scene", within=0.5, detail=True),
+    Metric(
+        *("consistency_psnr", "consistency PSNR"),
+        unit="dB",
+        digits=2,
+        per="scene",
+        within=0.5,
+        detail=True,
+        rewards="white views and blur",
+    ),
     Metric("consistency_psnr_truth", "of truth", None, "dB", digits=2, per="scene", detail=True),
 )
 """By name, in the order in which all show them. `register` adds those that come with a config or with a row."""

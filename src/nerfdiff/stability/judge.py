@@ -34,6 +34,15 @@ SIGNS = {
     "unlike": "the input is unlike the training images ({:.2f} of their usual distance)",
 }
 """What each sign says where it is out of its limits."""
+LEAST, MOST = "least", "most"
+ENDS = {
+    **dict.fromkeys(
+        ("input_psnr", "input_iou", "least_coverage", "agreement", "moved", "samples", "denoised"), (LEAST,)
+    ),
+    **dict.fromkeys(("border", "haze", "unlike"), (MOST,)),
+    **dict.fromkeys(("coverage", "flatness"), (LEAST, MOST)),
+}
+"""At which end each sign is bad."""
 OK = "ok"
 
 

@@ -10,11 +10,13 @@ import numpy as np
 from nerfdiff.metrics.predictions import SCENE
 from nerfdiff.results.frame import Run
 from nerfdiff.stability.breaking import Rules
+from nerfdiff.stability.judge import ENDS, LEAST, MOST
 from nerfdiff.stability.study import read_scenes
 from nerfdiff.stress.axes import stress_files
 from nerfdiff.utils.hashes import sha256_values
 
-LEAST, MOST = "least", "most"
+GAIN = 0.04
+"""Share of the broken scenes that a further limit must tell more than: one scene alone is chance."""
 Limits = dict[tuple[str, str], float]
 """By sign and `least` or `most`."""
 
@@ -47,23 +49,26 @@ def rates(limits: Limits, samples: Sequence[Sample]) -> tuple[float, float]:
     return recall, float(said[~broken].mean()) if (~broken).any() else math.nan
 
 
-def fit_limits(samples: Sequence[Sample], false_alarms: float, steps: int) -> Limits:
+def fit_limits(samples: Sequence[Sample], false_alarms: float, steps: int, margin: float) -> Limits:
     """Add the limit that tells most of the broken scenes which are still untold, while false alarms stay few.
 
     Args:
         false_alarms: share of sound scenes that may be suspected, over all limits.
         steps: limits at most.
+        margin: standard deviations of the sound scenes' signs that a limit is moved away from them.
     """
     broken = np.array([sample.broken for sample in samples], dtype=bool)
     names = sorted({name for sample in samples for name in sample.signs})
     values = {name: np.array([sample.signs.get(name, math.nan) for sample in samples], float) for name in names}
+    slack = {name: margin * _spread(values[name][~broken]) for name in names}
     told, limits = np.zeros(len(samples), dtype=bool), Limits()
     allowed = math.floor(false_alarms * int((~broken).sum()))
     for _ in range(steps):
-        best, gain = None, (0, 0)
+        best, gain = None, (max(1, round(GAIN * int(broken.sum()))), -len(samples))
         for name in names:
-            for end in (LEAST, MOST):
-                for cut in _cuts(values[name]):
+            for end in ENDS[name]:
+                for near in _cuts(values[name]):
+                    cut = near - slack[name] if end == LEAST else near + slack[name]
                     new = told | (values[name] < cut if end == LEAST else values[name] > cut)
                     alarms = int((new & ~broken).sum())
                     # of equal gains that with fewer false alarms
@@ -75,6 +80,11 @@ def fit_limits(samples: Sequence[Sample], false_alarms: float, steps: int) -> Li
         name, end, cut, told = best
         limits[name, end] = float(cut)
     return limits
+
+
+def _spread(values: np.ndarray) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.std()) if len(known) else 0.0
 
 
 def _cuts(values: np.ndarray) -> np.ndarray:

@@ -71,6 +71,7 @@ benchmark() {
     shift 2
     # shellcheck disable=SC2016
     step "$share" "$name" bash -c 'exec "$0" "$@" --until $UNTIL' $python "benchmarks/$name.py" "$@" --out "$work/results/$SECONDS"
+    compgen -G "$work/results/*" > /dev/null || return 0
     tar -C "$work" -cf "$OUT/results.tar" results
     $python benchmarks/report.py "$work"/results/* > "$OUT/table.txt"
 }
@@ -80,13 +81,13 @@ train() {
     local name=$1
     shift
     timeout -k 5 "$(($(left) - export_seconds))" $python src/train_resident.py run_name="$name" paths.runs_dir="$work/runs" \
-        data.root="$work/cars" data.cache_dir="$work/cache" init="${INIT:-$PWD/assets/demo}" fresh_cdm=true \
+        data.root="$work/cars" data.cache_dir="$work/cache" init="${INIT:-$PWD/assets/demo}" fresh_cdm=true dtype=float16 \
         optimizer.lr=8e-4 minutes="$minutes" data.about="'procedural cars seen from elevations of 0 to 90 degrees'" "$@" > "$work/$name.log" 2>&1
 }
 
 part2() {
-    # decoding and rendering come before the minutes of training, exports after them
-    local reading=${READING:-75} export_seconds=${EXPORTING:-40} more=() pids=() names=(demo demo_paper)
+    # decoding and rendering come before the minutes of training, files are written after them
+    local reading=${READING:-75} export_seconds=${EXPORTING:-20} more=() pids=() names=(demo demo_paper)
     $python benchmarks/pack_scenes.py unpack "$PACKS/cars.zip" "$work/cars" || return
     [ "$tiny" ] && more=(steps=2 data.batch_size=2 data.target_views=2 data.train_source_views=2 precision=32-true)
     minutes=$($python -c "print(max(0.05, ($(left) - $reading - $export_seconds) / 60))")
@@ -106,9 +107,7 @@ part2() {
 # collect NAME: the exported model, in half precision, and the last averages with the curves
 collect() {
     local run=$work/runs/$1 last
-    if [ -f "$run/model/model.safetensors" ]; then
-        $python src/export.py ckpt="$run/model" out="$work/half/$1" dtype=float16 && tar -C "$work/half" -cf "$OUT/$1.tar" "$1"
-    fi
+    [ -f "$run/model/model.safetensors" ] && tar -C "$run" --transform "s/^model/$1/" -cf "$OUT/$1.tar" model
     [ -d "$run" ] || return
     last=$(cd "$run" && ls -t snapshots/* 2> /dev/null | head -n 2)
     # cat NAME_averages.tar.* | tar x

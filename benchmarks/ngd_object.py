@@ -25,6 +25,8 @@ from harness import Row, Unavailable, Work, interleaved, parser, settings_of
 from inner_step import steps_of
 from nerfdiff.cli import choices, load_config
 from nerfdiff.data.batch import ViewBatch
+from nerfdiff.diffusion.denoiser import cast_products
+from nerfdiff.diffusion.sampler import time_steps
 from nerfdiff.distill.distillation import Distillation
 from nerfdiff.distill.virtual_views import VirtualViews
 from nerfdiff.fit.inner_steps import InnerSteps
@@ -53,7 +55,7 @@ class Plan:
     """
 
     strategy: dict[str, Any]
-    budget: dict[str, int]
+    budget: dict[str, Any]
     steps: int | None
 
     @staticmethod
@@ -77,7 +79,21 @@ class Plan:
         return min(self.steps or self.budget["steps"], self.budget["steps"])
 
     def method(self, steps: int) -> Distillation:
-        return instantiate(self.strategy | {"teacher": self.strategy["teacher"] | {"steps": steps}})
+        """Fewer steps than the budget's leave nothing out: how many have full guidance is no fixed share of them."""
+        teacher = self.strategy["teacher"] | {"steps": steps}
+        if steps < self.budget["steps"] and "at_full_guidance" in teacher:
+            teacher["at_full_guidance"] = "everything"
+        return instantiate(self.strategy | {"teacher": teacher})
+
+    def asked(self, steps: int) -> tuple[int, int]:
+        """Return in how many of so many steps the denoiser is asked, and the field fitted."""
+        given = self.method(steps).teacher.keywords
+        if "guidance" not in given or self.timed < self.budget["steps"]:
+            return steps, steps
+        times = time_steps(steps, given["t_max"], given["t_min"], given["spacing"])[:-1]
+        full = sum(given["guidance"].replaces(t) for t in times)
+        at = given["at_full_guidance"]
+        return steps - full * (at != "everything"), steps - full * (at == "nothing")
 
     @property
     def keeps_coarse(self) -> bool:
@@ -90,7 +106,7 @@ class Plan:
         if self.timed == every:
             return None
         if extrapolate:
-            return f"EXTRAPOLATED: objects are computed from {self.timed} of {every} diffusion steps"
+            return f"EXTRAPOLATED: objects are computed from {self.timed} of {every} diffusion steps, none left out"
         return f"PARTIAL: objects are of {self.timed} diffusion steps, where the budget has {every}"
 
 
@@ -155,7 +171,7 @@ def _measure(arguments: argparse.Namespace, measured: Subject, setting: dict[str
         row.name = f"{setting['scenes']} objects, {name}" if setting["scenes"] > 1 else f"object, {name}"
         row.setting = setting
     for name, row in ran.items():
-        row.work = _work(measured, ways[name].plan.budget, setting, timed[name])
+        row.work = _work(measured, ways[name].plan, setting, timed[name])
         row.more["s/object"] = row.seconds["median"] / setting["scenes"]
         row.more["objects/min"] = 60 * setting["scenes"] / row.seconds["median"]
     report.add(list(found.values()))
@@ -190,6 +206,8 @@ def _ways(arguments: argparse.Namespace, measured: Subject, views: int) -> dict[
     backends = renderers(measured.model, measured.model.renderer)
     ways: dict[str, Way | Unavailable] = {}
     for unets, model in models(measured.model.requires_grad_(False), arguments.compile).items():
+        if unets != "eager" and measured.dtype == torch.bfloat16:  # copies, and as in evaluation
+            cast_products(model.denoiser, torch.bfloat16)
         for name, renderer in backends.items():
             if isinstance(renderer, Unavailable):
                 ways[f"{name}, {unets}"] = renderer
@@ -279,7 +297,7 @@ def _pieces(measured: Subject, way: Way, one: ViewBatch, setting: dict[str, int]
 
     def render():
         with torch.no_grad(), measured.autocast():
-            field.render(model.renderer, cameras, keep_coarse=keep)
+            field.render(method.fit.guidance(model.renderer), cameras, keep_coarse=keep)
 
     shape = {"rays": budget["rays"], "plane": measured.size} | setting
     return {
@@ -291,21 +309,23 @@ def _pieces(measured: Subject, way: Way, one: ViewBatch, setting: dict[str, int]
     }
 
 
-def _work(measured: Subject, budget: dict[str, int], setting: dict[str, int], steps: int) -> Work | None:
-    """Count the work of NGD on all scenes: encoding, conditions, and at every step denoising, rendering and N
-    inner steps. None where not all of the CDM is computed."""
-    if budget["deep_every"] > 1:
+def _work(measured: Subject, plan: Plan, setting: dict[str, int], steps: int) -> Work | None:
+    """Count the work of NGD on all scenes: encoding, conditions, and denoising, rendering and N inner steps at all
+    steps but those that leave them out. None where not all of the CDM is computed."""
+    if plan.budget["deep_every"] > 1:
         return None
     config, size, renderer = measured.config, measured.size, measured.model.renderer
+    pixels, (denoisings, fits) = setting["views"] * size**2, plan.asked(steps)
     encoding = costs.encoding(config, size, measured.dtype)
-    shown = costs.rendering(renderer, config, size, setting["views"] * size**2, 1, backward=False)
+    shown = costs.rendering(renderer, config, size, pixels, 1, backward=False)
+    guides = costs.rendering(plan.method(1).fit.guidance(renderer), config, size, pixels, 1, backward=False)
     denoised = costs.denoising(config, size, setting["views"], measured.dtype)
-    fitted = _fitting(measured, budget, 1)
+    fitted = _fitting(measured, plan.budget, 1)
 
     def total(name: str) -> float:
         once = getattr(encoding, name) + getattr(shown, name)
-        each = getattr(denoised, name) + getattr(shown, name) + getattr(fitted, name)
-        return setting["scenes"] * (once + steps * each)
+        each = denoisings * getattr(denoised, name) + fits * (getattr(guides, name) + getattr(fitted, name))
+        return setting["scenes"] * (once + each)
 
     return Work(total("flops"), total("bytes"))
 

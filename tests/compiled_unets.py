@@ -11,7 +11,7 @@ import torch
 from torch._dynamo.utils import counters
 
 from model_fixtures import model
-from nerfdiff.compilation import compile_unets
+from nerfdiff.compilation import REGIONS, compile_unets
 from nerfdiff.diffusion.deep_features import DeepFeatures, DeepReuse
 from nerfdiff.model import NerfDiff
 
@@ -53,23 +53,28 @@ def same(one: list[torch.Tensor], other: list[torch.Tensor]) -> None:
 
 if __name__ == "__main__":
     backend, cache = sys.argv[1:]
-    # generated code takes seconds per kernel: the smallest U-Net that shows it
+    # the smallest U-Net that shows it
     generated = {"channel_mult": [1], "res_blocks": 0, "attention_downsampling": []}
     sizes = generated if backend == "inductor" else {"checkpointing": [2], "channel_mult": [1, 1]}
     plain, images = build(**sizes), torch.rand(2, 6, 8, 8, generator=torch.Generator().manual_seed(0))
-    net = copy.deepcopy(plain)
-    compile_unets(net, "unets", cache, backend)
-    assert list(net.state_dict()) == list(plain.state_dict())
-    if backend == "inductor":
-        with torch.no_grad():
-            same([net.encoder.unet(images[:, :3])[0]], [plain.encoder.unet(images[:, :3])[0]])
-    else:
-        same(train(net, images), train(plain, images))
-        same(sample(net, images), sample(plain, images))
-        with torch.autocast("cpu", torch.bfloat16):
-            assert torch.isfinite(sample(net, images)[0]).all()
-        copies = copy.deepcopy(net), pickle.loads(pickle.dumps(net))
-        same(sample(copies[0], images), sample(copies[1], images))
-    assert not counters["graph_break"], counters["graph_break"]
-    assert counters["frames"]["ok"] > 0
+    # generated code takes seconds per kernel
+    for choice in ("unets",) if backend == "inductor" else REGIONS:
+        plain.zero_grad()
+        net = copy.deepcopy(plain)
+        compile_unets(net, choice, cache, backend)
+        assert list(net.state_dict()) == list(plain.state_dict())
+        assert all(bool(m._compiled_call_impl) == isinstance(m, REGIONS[choice]) for m in net.modules())
+        if backend == "inductor":
+            with torch.no_grad():
+                same([net.encoder.unet(images[:, :3])[0]], [plain.encoder.unet(images[:, :3])[0]])
+        else:
+            same(train(net, images), train(plain, images))
+            same(sample(net, images), sample(plain, images))
+            with torch.autocast("cpu", torch.bfloat16):
+                assert torch.isfinite(sample(net, images)[0]).all()
+            copies = copy.deepcopy(net), pickle.loads(pickle.dumps(net))
+            same(sample(copies[0], images), sample(copies[1], images))
+        assert not counters["graph_break"], counters["graph_break"]
+        assert counters["frames"]["ok"] > 0
+        counters.clear()
     print("same")

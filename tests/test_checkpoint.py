@@ -1,9 +1,16 @@
 """Models are loaded with the renderer that a run asks for; what is saved stays as it was trained."""
 
-import pytest
+import shutil
+from dataclasses import replace
+from pathlib import Path
 
-from nerfdiff.checkpoint import load_model
-from nerfdiff.utils.errors import ConfigError
+import pytest
+import torch
+
+from model_fixtures import config
+from nerfdiff.checkpoint import LoadedModel, export_model, load_model
+from nerfdiff.model import NerfDiff
+from nerfdiff.utils.errors import CheckpointError, ConfigError
 
 SETTINGS = ({}, {"backend": "torch", "kernel_precision": "tf32"}, {"uniform_samples": 3, "chunk": 2048})
 
@@ -21,3 +28,43 @@ def test_settings_that_a_renderer_cannot_have_are_no_fault_of_the_checkpoint(set
     ((name, value),) = settings.items()
     with pytest.raises(ConfigError, match=f"{name}='{value}': choose auto"):
         load_model("demo", "ema", renderer=settings)
+
+
+@pytest.fixture
+def pair(tmp_path):
+    """Two exports of models that differ in their CDM alone; the second shares the first's other weights."""
+    made = [LoadedModel(NerfDiff(**config()).eval(), Path("made"), "ema", config(), [12, 12], {}) for _ in range(2)]
+    made[1].model.encoder.load_state_dict(made[0].model.encoder.state_dict())
+    made[1].model.decoder.load_state_dict(made[0].model.decoder.state_dict())
+    one = export_model(made[0], tmp_path / "one", torch.float16)
+    return made, one, export_model(made[1], tmp_path / "two", torch.float16, tmp_path / "one")
+
+
+def test_equal_weights_are_shared_and_the_model_is_the_same(pair, tmp_path):
+    made, one, two = pair
+    assert two.stat().st_size < 0.6 * one.stat().st_size
+    alone = export_model(made[1], tmp_path / "alone", torch.float16)
+    first, second = (load_model(path.parent, "ema").model.state_dict() for path in (two, alone))
+    assert first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_a_shared_model_that_is_gone_or_another_is_refused(pair, tmp_path):
+    made, one, two = pair
+    export_model(replace(made[1]), tmp_path / "one", torch.float16)
+    with pytest.raises(CheckpointError, match="with which it was exported, and these are others"):
+        load_model(two.parent, "ema")
+    shutil.rmtree(one.parent)
+    with pytest.raises(CheckpointError, match="are not there: copy both folders together"):
+        load_model(two.parent, "ema")
+
+
+def test_only_a_neighbour_that_has_equal_weights_is_shared(pair, tmp_path):
+    made, one, _ = pair
+    with pytest.raises(ConfigError, match="only a model in the folder that"):
+        export_model(made[1], tmp_path / "deep" / "two", torch.float16, one.parent)
+    other = NerfDiff(**config())
+    with torch.no_grad():
+        for value in [*other.parameters(), *other.buffers()]:
+            value.add_(1)
+    with pytest.raises(ConfigError, match="has none of the weights"):
+        export_model(replace(made[0], model=other), tmp_path / "two", torch.float16, one.parent)

@@ -32,7 +32,32 @@ def test_every_experiment_composes_and_is_not_ignored(experiment):
 
 @pytest.mark.parametrize("trainer", ["auto", "cpu", "gpu", "ddp"])
 def test_every_trainer_composes(trainer):
-    assert load_config("train", [f"trainer={trainer}"]).trainer.max_steps == 500_000
+    cfg = load_config("train", [f"trainer={trainer}"])
+    assert cfg.trainer.max_steps == 500_000
+    OmegaConf.resolve(cfg.callbacks.previews.sampler)
+
+
+STRATEGIES, BUDGETS = (sorted(p.stem for p in (CONF / group).glob("*.yaml")) for group in ("strategy", "budget"))
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_every_strategy_composes_with_the_fast_budget(strategy):
+    cfg = load_config("distill", ["ckpt=demo", f"strategy={strategy}", "budget=fast"])
+    method = instantiate(cfg.strategy)
+    settings = method.teacher.keywords if strategy not in ("none", "cdm") else cfg.strategy
+    if strategy not in ("none", "sds"):
+        assert (settings["sampler"], settings["spacing"]) == ("dpmpp_2m", "uniform_lambda")
+        assert settings.get("sampler_steps", settings["steps"]) == 16
+    if "teacher" in cfg.strategy:
+        assert (method.fit.inner_steps, method.fit.guidance_uniform_samples) == (64, 32)
+    assert settings.get("at_full_guidance", "nothing") == "nothing"
+
+
+def test_budgets_have_the_same_keys_and_each_is_read():
+    budgets = [OmegaConf.load(CONF / f"budget/{name}.yaml") for name in BUDGETS]
+    assert len({frozenset(budget) for budget in budgets}) == 1
+    read = "".join(path.read_text() for path in CONF.rglob("*.yaml"))
+    assert all(f"${{budget.{key}}}" in read for key in budgets[0])
 
 
 def test_the_papers_numbers():

@@ -40,5 +40,5 @@ def test_not_to_compile_leaves_the_model_alone(tmp_path):
 
 
 def test_another_choice_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="choose none or unets"):
+    with pytest.raises(ConfigError, match="choose none, unets, blocks"):
         compile_unets(model(), "regions", tmp_path)

@@ -151,9 +151,8 @@ def test_guide_and_inner_step(teacher, coarse, backend):
         fit = FitSettings(1, 16, 5e-2, 1e-4, "linear", True, 1.0, 10.0, coarse, False)
         module = NGDModule(field, [virtual], [TEACHERS[teacher](virtual)], fit, [(0,)])
         module._device = DEVICE
-        (optimizer,), (scheduler,) = module.configure_optimizers()
+        optimizer = module.configure_optimizers()
         module.optimizers = lambda: SimpleNamespace(optimizer=optimizer)
-        module.lr_schedulers = lambda: scheduler
         module.on_train_start()
         module.on_train_batch_start(0, 0)
         gpu.copies.clear()

@@ -199,14 +199,17 @@ def _instead(path: Path) -> str:
     )
 
 
-def export_model(loaded: LoadedModel, folder: str | Path, dtype: torch.dtype) -> Path:
+def export_model(loaded: LoadedModel, folder: str | Path, dtype: torch.dtype, shared: str | Path | None = None) -> Path:
     """Write weights (safetensors) and the settings (YAML) that rebuild the model.
 
     Args:
         dtype: of the stored weights.
+        shared: an exported model's folder beside this one. Weights that are the same there are not written again, and
+            are read from there; it has to stay beside this one.
 
     Raises:
         CheckpointError: weights are not finite, or beyond what `dtype` holds; nothing is written.
+        ConfigError: `shared` is elsewhere, or shares nothing.
     """
     folder = Path(folder)
     state = {name: value.to("cpu", dtype).contiguous() for name, value in loaded.model.state_dict().items()}
@@ -221,9 +224,19 @@ def export_model(loaded: LoadedModel, folder: str | Path, dtype: torch.dtype) ->
                 f"{loaded.path} holds weights of {value.abs().max():.3g} ({name}), and {dtype} only holds "
                 f"{torch.finfo(dtype).max:.3g}: choose dtype=bfloat16 or float32"
             )
+    settings = {"weights": loaded.weights, "image_size": loaded.image_size, "model": dict(loaded.config)}
+    if shared is not None:
+        other = Path(shared) / WEIGHTS
+        if folder.absolute().parent != other.absolute().parents[1]:
+            raise ConfigError(f"shared={shared}: only a model in the folder that {folder} is in can be shared")
+        theirs = _load_weights(other)
+        own = {n: v for n, v in state.items() if n not in theirs or not torch.equal(v, theirs[n].to(v.dtype))}
+        if len(own) == len(state):
+            raise ConfigError(f"shared={shared} has none of the weights of {loaded.path}")
+        state = own
+        settings["shared"] = {"folder": Path(shared).absolute().name, "sha256": sha256_file(other)}
     with atomic(folder / WEIGHTS) as temporary:
         save_file(state, temporary)
-    settings = {"weights": loaded.weights, "image_size": loaded.image_size, "model": dict(loaded.config)}
     settings |= {"stability": dict(loaded.stability)} if loaded.stability else {}
     settings |= {"trained_on": [dict(phase) for phase in loaded.trained_on]} if loaded.trained_on else {}
     settings["sha256"] = _digest(folder / WEIGHTS, settings)
@@ -239,6 +252,7 @@ def export(
     assets: str | Path | None,
     average: float | None = None,
     step: int | None = None,
+    shared: str | None = None,
 ) -> Path:
     """`load_model`, then `export_model`; returns the file.
 
@@ -260,7 +274,7 @@ def export(
         loaded.model.load_state_dict(state, strict=False)  # buffers are no part of an average
         phases = [*loaded.trained_on[:-1], *({**phase, "average": average} for phase in loaded.trained_on[-1:])]
         loaded = replace(loaded, trained_on=phases)
-    return export_model(loaded, out, DTYPES[dtype])
+    return export_model(loaded, out, DTYPES[dtype], shared)
 
 
 def differences(old: Mapping, new: Mapping, prefix: str = "") -> list[str]:
@@ -335,16 +349,36 @@ def _read_export(path: Path, weights: str) -> Read:
         ) from error
     if weights != stored:
         raise CheckpointError(f"{path} holds {stored} weights only: use weights={stored}")
-    try:
-        state = load_file(path)
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path} is not a readable safetensors file ({error})") from error
+    state = _load_weights(path)
     if digest is not None and digest != _digest(path, settings):  # exports from before have none
         raise CheckpointError(
             f"{path} and {path.with_name(CONFIG)} are not as they were written together (their SHA-256 is another): "
             "one of the two was damaged, edited or exchanged. Export or copy both anew"
         )
+    if shared := settings.get("shared"):
+        state = _shared_weights(path, shared) | state
     return config, state, settings
+
+
+def _load_weights(path: Path) -> dict[str, torch.Tensor]:
+    try:
+        return load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{path} is not a readable safetensors file ({error})") from error
+
+
+def _shared_weights(path: Path, shared: Any) -> dict[str, torch.Tensor]:
+    """Return the weights of the model beside this one that it was exported with."""
+    kinds = {"folder": str, "sha256": str}
+    if not isinstance(shared, Mapping) or not all(isinstance(shared.get(key), kind) for key, kind in kinds.items()):
+        raise CheckpointError(f"{path.with_name(CONFIG)}: expected a folder and its sha256 as its shared")
+    other = path.parents[1] / Path(shared["folder"]).name / WEIGHTS
+    if not other.is_file() or sha256_file(other) != shared["sha256"]:
+        raise CheckpointError(
+            f"{path} needs the weights of {other}, with which it was exported, and these "
+            f"{'are others' if other.is_file() else 'are not there'}: copy both folders together"
+        )
+    return _load_weights(other)
 
 
 def _digest(weights: Path, settings: Mapping) -> str:

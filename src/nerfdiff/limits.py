@@ -59,7 +59,9 @@ LIMITS: dict[str, tuple[float, float, str]] = {
     "*views_at_once": AT_LEAST_1,
     "budget.inner_steps": AT_LEAST_0,
     "strategy.inner_steps": AT_LEAST_0,
-    "budget.*": AT_LEAST_1,
+    **{f"budget.{key}": AT_LEAST_1 for key in ("steps", "sampler_steps", "rays", "views", "deep_every")},
+    "budget.guidance_samples": AT_LEAST_1,
+    "strategy.guidance_importance_samples": AT_LEAST_0,
     "strategy.rays": AT_LEAST_1,
     "strategy.steps": AT_LEAST_1,
     "strategy.teacher.steps": AT_LEAST_1,
@@ -101,15 +103,20 @@ LIMITS: dict[str, tuple[float, float, str]] = {
 """By keys, in which * stands for any part: the least and largest number and these in words. The first that fits counts;
 of a list, each number is meant."""
 
+SWITCHED_OFF = {"orbit": "orbit.frames=0", "sheet": "sheet.scenes=0"}
+"""Groups of settings that are needed, and what switches off what they are about."""
+
 
 def check_limits(config: DictConfig) -> None:
-    """Refuse a composed config with a number that no run can have.
+    """Refuse a composed config with a number that no run can have, or without settings that are needed.
 
     Raises:
         ConfigError: naming the key, its value and what it can be.
     """
     # what was set before what follows from it: the message is to name the key that a person set
     for key, value, _ in sorted(_values(config), key=lambda found: found[2]):
+        if value is None and key in SWITCHED_OFF:
+            raise ConfigError(f"{key}=null: for none, set {SWITCHED_OFF[key]}")
         check_limit(key, value)
 
 

@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -112,6 +113,16 @@ def test_what_is_timed_in_part_is_said(tmp_path, monkeypatch):
     row = ran(content)["2 objects, reference"]
     assert row["more"]["s/object"] == pytest.approx(row["seconds"]["median"] / 2)
     assert "extrapolated from steps" not in row["more"]
+
+
+@pytest.mark.parametrize(("budget", "steps", "asked"), [("minutes", 16, (10, 16)), ("fast", 16, (8, 8))])
+def test_steps_that_are_left_out_count_as_no_work(budget, steps, asked):
+    """w = 1 for t of 0.681 and more; of extrapolated steps none is left out."""
+    arguments = SimpleNamespace(strategy="ngd", budget=budget, steps=None)
+    assert ngd_object.Plan.of(arguments, ()).asked(steps) == asked
+    arguments.steps = 4
+    part = ngd_object.Plan.of(arguments, ())
+    assert part.asked(steps) == (steps, steps) and part.method(4).teacher.keywords["at_full_guidance"] == "everything"
 
 
 def test_extrapolating_asks_for_what_it_needs():

@@ -3,7 +3,7 @@ import torch
 
 from model_fixtures import config, input_cameras, look_at, model
 from nerfdiff.cameras import Cameras
-from nerfdiff.diffusion.denoiser import gaussian_velocity
+from nerfdiff.diffusion.denoiser import cast_products, gaussian_velocity
 from nerfdiff.diffusion.schedule import add_noise, alpha_sigma, v_from_x0_eps
 from nerfdiff.utils.errors import ConfigError
 
@@ -45,6 +45,25 @@ def test_every_variant_sees_the_input_image_and_the_wanted_view(variant):
     assert not torch.allclose(x0[0], x0[1], atol=1e-5), "two views, one noise: only the camera differs"
     changed = net.denoiser(z, HALF, condition_of(net, other))
     assert not torch.allclose(x0, changed, atol=1e-5)
+
+
+@pytest.mark.parametrize("variant", ["preconditioned", "concat"])
+def test_weights_cast_once_denoise_as_those_that_autocast_casts_at_each_call(variant):
+    net = build(variant).requires_grad_(False).to(memory_format=torch.channels_last)
+    names, z = list(net.state_dict()), torch.randn(2, 3, 16, 16)
+    with torch.autocast("cpu", torch.bfloat16, cache_enabled=False):
+        condition = condition_of(net, torch.rand(1, 3, 16, 16))
+        each_call = net.denoiser(z, HALF, condition)
+        cast_products(net.denoiser, torch.bfloat16)
+        assert torch.equal(net.denoiser(z, HALF, condition), each_call)
+    assert list(net.state_dict()) == names
+    types = {type(layer): layer.weight.dtype for layer in net.denoiser.modules() if hasattr(layer, "weight")}
+    assert types == {
+        torch.nn.Conv2d: torch.bfloat16,
+        torch.nn.Linear: torch.bfloat16,
+        torch.nn.GroupNorm: torch.float32,
+    }
+    assert {p.dtype for part in (net.encoder, net.decoder) for p in part.parameters()} == {torch.float32}
 
 
 def test_a_denoised_image_is_alpha_z_minus_sigma_v():

@@ -54,9 +54,9 @@ def sampling(sampler="ddim", eta=0.0) -> SamplerSettings:
     return SamplerSettings(1.0, 0.0, "uniform_t", sampler, eta)
 
 
-def guided(gamma=0.3, schedule="snr", condition="first", sampler="ddim", eta=0.0):
-    guidance = Guidance(schedule, gamma, "current")
-    return lambda views: NGDTeacher(views, 4, sampling(sampler, eta), guidance, condition)
+def guided(gamma=0.3, schedule="snr", condition="first", sampler="ddim", eta=0.0, compare="current", at="fit"):
+    guidance = Guidance(schedule, gamma, compare)
+    return lambda views: NGDTeacher(views, 4, sampling(sampler, eta), guidance, condition, at)
 
 
 TEACHERS = {
@@ -263,6 +263,86 @@ def test_full_guidance_asks_for_what_is_rendered_already():
     net = model().requires_grad_(False)
     module = distillation(guided(1.0, "constant")).distil(net, [scene()], seed=0)
     assert all(step.agreement == pytest.approx(60, abs=0.1) for step in module.trace(0))
+
+
+def distilled(at, fit=(), **teacher):
+    net = model(conditioning={"residual_std": 0.2}).requires_grad_(False)
+    net.denoiser.unet.conv_out.bias.fill_(2.0)
+    return distillation(guided(at=at, **teacher), **dict(fit)).distil(net, [scene("a"), scene("b")], seed=0)
+
+
+@pytest.mark.parametrize(
+    "teacher", [{"eta": 1.0}, {"sampler": "dpmpp_2m", "condition": "current"}, {"schedule": "linear", "gamma": 2}]
+)
+def test_the_denoiser_is_not_asked_where_renderings_take_its_images_place(teacher):
+    """At t = 1 and 0.75 of 1, 0.75, 0.5, 0.25; with 2t at 0.5 too."""
+    everything, fit = (distilled(at, **teacher) for at in ("everything", "fit"))
+    assert torch.equal(everything.field.planes, fit.field.planes)
+    assert [everything.trace(scene) for scene in (0, 1)] == [fit.trace(scene) for scene in (0, 1)]
+    assert everything.views[0].field_queries == fit.views[0].field_queries
+    assert [m.views[1].denoiser_calls for m in (everything, fit)] == [12, 3 if "gamma" in teacher else 6]
+
+
+@pytest.mark.parametrize("fit", [{}, {"fit_source": True, "coarse": "refresh", "lr_decay": "linear"}])
+def test_a_field_is_not_fitted_to_its_own_renderings(fit):
+    """The step that follows sees what it would have seen: noise, rates and the field as it began."""
+    module = distilled("nothing", fit)
+    skipped, last = module.trace(0)[:2], module.trace(0)[2]
+    assert [step.weight for step in skipped] == [1, 1] and 0 < last.weight < 1
+    assert all(step.loss_first is step.loss_last is None and step.agreement == pytest.approx(60) for step in skipped)
+    assert last.loss_first > 0 and module.statuses == ["ok", "ok"] and module.views[0].denoiser_calls == 6
+    frozen = distilled("fit", {**fit, "lr_planes": 0.0, "lr_decoder": 0.0})
+    assert frozen.trace(0)[2].agreement == last.agreement  # of the same images, drawn towards the same field
+    # three renderings of the field (at its beginning, and before the last step) and of what it is compared with
+    view = 16 * 16 * module.views[0].model.renderer.samples_per_ray
+    fitted = 2 * 3 * 64 * module.views[0].model.renderer.samples_per_ray
+    views = 3 + 2 * (4 if "coarse" in fit else 3) + 2 * (3 + 1)
+    assert module.views[0].field_queries == views * view + fitted
+    unguided = distilled("nothing", fit, compare="last")
+    assert unguided.views[0].denoiser_calls == 12 and unguided.trace(0)[0].loss_first is not None
+
+
+def test_an_unknown_choice_at_full_guidance_is_refused_with_the_known_ones():
+    with pytest.raises(ConfigError, match="at_full_guidance='never': choose everything, fit, nothing"):
+        distilled("never")
+
+
+def test_renderings_for_the_teacher_have_samples_of_their_own(monkeypatch):
+    """And no others: those that decide about a fallback, and inner steps, have the model's."""
+    net = model().requires_grad_(False)
+    own = net.renderer.uniform_samples, net.renderer.importance_samples
+    seen, render = [], RefinedField.render
+
+    def noted(self, renderer, cameras, *args):
+        seen.append((renderer.uniform_samples, renderer.importance_samples))
+        return render(self, renderer, cameras, *args)
+
+    monkeypatch.setattr(RefinedField, "render", noted)
+    view, queries = 16 * 16, {}
+    for counts, used in (((None, None), own), ((3, 0), (3, 0)), ((own[0] + 1, 2), (own[0], 2))):
+        seen.clear()
+        fit = {"guidance_uniform_samples": counts[0], "guidance_importance_samples": counts[1]}
+        module = distillation(TEACHERS["ngd"], **fit).distil(net, [scene()], seed=0)
+        assert seen == 4 * [used] + 4 * [own]
+        queries[counts] = module.views[0].field_queries
+    assert queries[None, None] - queries[3, 0] == 4 * 3 * view * (sum(own) - 3)
+    assert distillation(TEACHERS["direct"], **fit).distil(net, [scene()], seed=0).statuses == ["ok"]
+
+
+def test_kept_coarse_weights_of_fewer_samples_are_split_into_the_renderer_s_bins(monkeypatch):
+    net = model().requires_grad_(False)
+    given, at = [], RayBatches.coarse_at
+    monkeypatch.setattr(RayBatches, "coarse_at", lambda *a: given.append(at(*a)) or given[-1])
+    fewer = {"guidance_uniform_samples": 3, "guidance_importance_samples": 2, "coarse": "refresh"}
+    assert distillation(TEACHERS["ngd"], **fewer).distil(net, [scene()], seed=0).statuses == ["ok"]
+    weights = given[0].unflatten(-1, (3, 2))
+    assert torch.equal(weights[..., 0], weights[..., 1]) and 0 < weights.sum((-1, -2)).max() <= 1
+    uneven = distillation(TEACHERS["ngd"], coarse="refresh", guidance_uniform_samples=4)
+    with pytest.raises(ConfigError, match=r"guidance_uniform_samples=4 bins cannot be .* divisor of 6"):
+        uneven.distil(net, [scene()], seed=0)
+    for count in ({"guidance_uniform_samples": 0}, {"guidance_importance_samples": -1}):
+        with pytest.raises(ConfigError, match=f"strategy.{next(iter(count))}=.* must be at least"):
+            distillation(TEACHERS["ngd"], **count)
 
 
 def test_without_guidance_and_inner_steps_views_are_plain_samples():

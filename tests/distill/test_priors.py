@@ -135,11 +135,11 @@ def test_fewer_views_than_asked_for_are_said_once(caplog):
     assert "data.eval_stride" in caplog.messages[0]
 
 
-@pytest.mark.parametrize("budget", ["budget=paper", "budget=minutes", "budget.views=7"])
+@pytest.mark.parametrize("budget", ["budget=paper", "budget=fast", "budget=minutes", "budget.views=7"])
 @pytest.mark.parametrize("data", ["abo", "abo_materials", "srn_cars", "srn_chairs", "clevr3d", "posed_images"])
 def test_the_budget_s_views_are_those_of_every_dataset_s_prior(data, budget):
     cfg = load_config("distill", ["ckpt=x", f"data={data}", budget])
-    assert cfg.prior.views == cfg.budget.views == {"paper": 50, "minutes": 25, "7": 7}[budget.split("=")[1]]
+    assert cfg.prior.views == cfg.budget.views == {"paper": 50, "fast": 50, "minutes": 25, "7": 7}[budget.split("=")[1]]
 
 
 def test_no_views_are_refused():

@@ -109,7 +109,7 @@ def test_k_is_the_number_of_views_that_fields_were_fitted_to(data, run, tmp_path
         settings = "prior=abo_views", f"budget.views={asked}", f"data.eval_stride={stride}", *small
         row = distill(config(data, run, tmp_path, *settings))
         assert (row.K, row.prior) == (used, "SceneCameras")
-        assert row.denoiser_calls == 2 * 2 * used  # scenes, steps
+        assert row.denoiser_calls == 2 * used  # of each scene; at t = 1, the first of two steps, no one asks
         assert (f"{used} virtual views instead of the {asked}" in caplog.text) == (used < asked)
     none = distill(config(data, run, tmp_path, "strategy=none", *small))
     assert none.K is none.prior is None
@@ -150,7 +150,10 @@ def test_what_cannot_act_on_a_picture_is_said(words, said, caplog):
 def test_the_field_in_the_file_is_the_one_whose_views_were_saved(precision, data, run, tmp_path):
     cfg = config(data, run, tmp_path, f"precision={precision}", "strategy.lr_decoder=1e-2")
     distill(cfg)
-    (scene,) = dataset_run(cfg, torch.device("cpu")).load(["scene1"])
+    evaluation = dataset_run(cfg, torch.device("cpu"))
+    cast = {name for name, value in evaluation.model.state_dict().items() if value.dtype != torch.float32}
+    assert bool(cast) == (precision == "bf16-mixed") and all(name.startswith("denoiser.") for name in cast)
+    (scene,) = evaluation.load(["scene1"])
     folder = scene_folder(tmp_path, "ngd", "scene1")
     saved = load_field(folder / FIELD)
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16-mixed"):

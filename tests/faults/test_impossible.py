@@ -87,6 +87,14 @@ def test_numbers_that_cannot_be_are_refused(command, word, defaults):
         check_limits(config)
 
 
+@pytest.mark.parametrize("group", ["orbit", "sheet"])
+def test_settings_that_are_needed_are_not_taken_away(group, defaults):
+    config = copy.deepcopy(defaults["distill"])
+    config[group] = None
+    with pytest.raises(ConfigError, match=rf"^{group}=null: for none, set {group}\."):
+        check_limits(config)
+
+
 @pytest.fixture(scope="module")
 def defaults():
     """Of all commands; theirs can be."""

@@ -133,6 +133,13 @@ def test_joint_training_with_another_conditioning_and_a_new_cdm(begun, tmp_path)
     assert sum(changed) > len(changed) / 2
 
 
+def test_renderings_of_a_frozen_field_say_how_far_they_are(begun, caplog):
+    _, scenes = scenes_of(begun[0])
+    with caplog.at_level("INFO"):
+        FrozenField(NerfDiff(**config()), scenes, 2, 3, torch.autocast("cpu", enabled=False), every_seconds=0)
+    assert "renderings of the frozen field: 50 % made" in caplog.text
+
+
 def test_draws_that_come_again_have_other_times(begun, monkeypatch):
     """The table has two steps; the golden-ratio sequence of times goes on."""
     _, scenes = scenes_of(begun[0])

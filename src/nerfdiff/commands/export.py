@@ -10,7 +10,7 @@ def main(cfg: DictConfig) -> None:
     """Averaged weights as safetensors with the settings that rebuild the model."""
     from nerfdiff.checkpoint import export
 
-    print(export(cfg.ckpt, cfg.weights, cfg.out, cfg.dtype, cfg.paths.assets_dir, cfg.average, cfg.step))
+    print(export(cfg.ckpt, cfg.weights, cfg.out, cfg.dtype, cfg.paths.assets_dir, cfg.average, cfg.step, cfg.shared))
 
 
 if __name__ == "__main__":

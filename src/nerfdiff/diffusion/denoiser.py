@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfdiff.cameras import Cameras
+from nerfdiff.diffusion.blocks import Upsample
 from nerfdiff.diffusion.deep_features import DeepFeatures
 from nerfdiff.diffusion.schedule import alpha_sigma, expand, x0_from_v
 from nerfdiff.diffusion.unet import Context, UNet
@@ -15,6 +16,18 @@ from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.images import to_signed
 
 IMAGES = ("rendered", "source", "none")
+
+
+def cast_products(denoiser: "Denoiser", dtype: torch.dtype) -> None:
+    """Keep the weights of a frozen denoiser's products in the type that autocast gives them at every call.
+
+    In place: for a copy in memory that is only evaluated. Under autocast all results are the same, bit for bit: norms
+    stay as they are, and so do weights that a CPU adds up before they are cast (`doubling_kernel`).
+    """
+    added_up = {layer.conv for layer in denoiser.modules() if isinstance(layer, Upsample)}
+    for layer in denoiser.modules():
+        if isinstance(layer, nn.Conv2d | nn.Linear) and not (layer.weight.device.type == "cpu" and layer in added_up):
+            layer.to(dtype)
 
 
 def gaussian_velocity(

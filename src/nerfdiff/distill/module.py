@@ -16,6 +16,7 @@ from nerfdiff.fit.ray_batches import RayBatches
 from nerfdiff.fit.refined_field import RefinedField, choose
 from nerfdiff.fit.settings import DECAYS, FitSettings
 from nerfdiff.metrics.image import psnr_of_mse
+from nerfdiff.render.renderer import Renderer
 from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.randomness import generator
 from nerfdiff.utils.timing import timed
@@ -58,6 +59,13 @@ class NGDModule(LightningModule):
                 "set scenes_at_once=1"
             )
         self.keeps_coarse = fit.coarse == "refresh" and teachers[0].follows_field and fit.inner_steps > 0
+        kept, bins = fit.guidance(self._renderer).uniform_samples, self._renderer.uniform_samples
+        if self.keeps_coarse and bins % kept:
+            raise ConfigError(
+                f"strategy.coarse=refresh: weights of strategy.guidance_uniform_samples={kept} bins cannot be split "
+                f"into the model's {bins} evenly: choose a divisor of {bins}, or strategy.coarse=every_step"
+            )
+        self._split = bins // kept
         self.statuses = ["ok"] * len(field)
         self.cameras = Cameras.join([v.cameras for v in views])
         self._source = torch.cat([v.encoding.source for v in views])
@@ -72,20 +80,15 @@ class NGDModule(LightningModule):
         """Return the teachers' steps."""
         return range(self.steps)
 
-    def configure_optimizers(self) -> tuple[list, list]:
-        # The rates are tensors so that a recorded step reads what they are when it is replayed.
-        rates = torch.tensor([self.settings.lr_planes, self.settings.lr_decoder], device=self.device)
-        groups = [
-            {"params": [self.field.planes], "lr": rates[0]},
-            {"params": list(self.field.decoder.parameters()), "lr": rates[1]},
-        ]
-        optimizer = torch.optim.Adam(groups, fused=True, capturable=self.device.type == "cuda")
-        decay, steps = DECAYS[self.settings.lr_decay], self.steps
-        return [optimizer], [torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: decay(step / steps))]
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        parameters = [self.field.planes], list(self.field.decoder.parameters())
+        groups = [{"params": own, "lr": torch.zeros((), device=self.device)} for own in parameters]
+        return torch.optim.Adam(groups, fused=True, capturable=self.device.type == "cuda")
 
     def on_train_start(self) -> None:
         self._start = self.field.snapshot()
         self._good = self._start
+        self._rendered: SceneImages | None = None
         self._finite = torch.ones(len(self.field), dtype=torch.bool, device=self.device)
         self._finite_on_host = torch.ones(len(self.field), dtype=torch.bool, pin_memory=self.device.type == "cuda")
         self._fitted = self.cameras
@@ -95,7 +98,7 @@ class NGDModule(LightningModule):
         self._batches = RayBatches(self._fitted, self.field.near, self.field.far)
         self._inner = InnerSteps(
             self.field,
-            self.views[0].model.renderer,
+            self._renderer,
             self._batches,
             self.optimizers().optimizer,
             self.settings.rays,
@@ -113,16 +116,17 @@ class NGDModule(LightningModule):
         with timed("guide"):
             rendered = self._render_guidance() if self.teachers[0].follows_field else None
         # ask the teachers for targets: the guided, denoised images
-        targets = torch.stack(
-            [
-                teacher.targets(step, None if rendered is None else rendered[scene])
-                if self._alive[scene]
-                else self._last_targets[scene]  # a scene that failed asks its teacher no more
-                for scene, teacher in enumerate(self.teachers)
-            ]
-        )
+        made = [
+            teacher.targets(step, None if rendered is None else rendered[scene])
+            if self._alive[scene]
+            else self._last_targets[scene]  # a scene that failed asks its teacher no more
+            for scene, teacher in enumerate(self.teachers)
+        ]
+        stays = any(images is None for images in made)  # for all scenes alike
+        targets = rendered if stays else torch.stack(made)
         # fit the field to them
-        losses = self._fit(targets)
+        self._set_rates(DECAYS[self.settings.lr_decay](step / self.steps))
+        losses = targets.new_zeros(0, len(targets)) if stays else self._fit(targets)
         # record, and keep the last finite field
         first, last = (losses[0], losses[-1]) if len(losses) else (None, None)
         distance = first if rendered is None else _mse(rendered, targets)
@@ -150,7 +154,11 @@ class NGDModule(LightningModule):
             self.field.restore(after, ~worse)
         for scene, (finite, diverged) in enumerate(zip(self._finite.tolist(), worse.tolist(), strict=True)):
             self.statuses[scene] = "non-finite" if not finite else "diverged" if diverged else "ok"
-        del self._inner, self._batches  # module and Trainer hold each other: free the largest tensors now
+        del (
+            self._inner,
+            self._batches,
+            self._rendered,
+        )  # module and Trainer hold each other: free the largest tensors now
 
     def trace(self, scene: int) -> list[Step]:
         """Return one scene's record, step by step. Waits for the device."""
@@ -174,13 +182,19 @@ class NGDModule(LightningModule):
         steps = self.settings.inner_steps
         if steps == 0:
             return targets.new_zeros(0, len(targets))
+        self._rendered = None
         both = torch.cat([targets, self._source[:, None]], 1) if self.settings.fit_source else targets
         self._batches.set_colours(both)
         losses = self._inner.run(steps)
-        self.lr_schedulers().step()
         for views in self.views:
             views.field_queries += steps * self._inner.queries
         return losses
+
+    def _set_rates(self, decay: float) -> None:
+        """Set the learning rates, in place: they are read when a recorded step is replayed."""
+        rates = self.settings.lr_planes, self.settings.lr_decoder
+        for group, rate in zip(self.optimizers().optimizer.param_groups, rates, strict=True):
+            group["lr"].fill_(rate * decay)
 
     def _keep_finite(self, losses: Float[Tensor, "steps scenes"], targets: SceneImages) -> None:
         """Keep the fields of scenes that are still finite, without waiting for the device. Others stay as they were."""
@@ -195,25 +209,31 @@ class NGDModule(LightningModule):
         self._good = choose(self._finite, self.field.snapshot(), self._good)
 
     def _render_guidance(self) -> SceneImages:
-        """Render the virtual views. Where coarse weights are kept, the input view is rendered too if fitted."""
-        if not self.keeps_coarse:
-            return self._render(self.cameras)
-        return self._render(self._fitted, keep_coarse=True)[:, : self.cameras.shape[1]]
+        """Render the virtual views, unless the field is the one that was rendered last. Where coarse weights are kept,
+        the input view is rendered too if fitted."""
+        if self._rendered is None:
+            cameras = self._fitted if self.keeps_coarse else self.cameras
+            rendered = self._render(cameras, self.settings.guidance(self._renderer), self.keeps_coarse)
+            self._rendered = rendered[:, : self.cameras.shape[1]]
+        return self._rendered
+
+    @property
+    def _renderer(self) -> Renderer:
+        return self.views[0].model.renderer
 
     @torch.no_grad()
-    def _render(self, cameras: Cameras, keep_coarse: bool = False) -> SceneImages:
-        renderer = self.views[0].model.renderer
+    def _render(self, cameras: Cameras, renderer: Renderer, keep_coarse: bool = False) -> SceneImages:
         rendering = self.field.render(renderer, cameras, keep_coarse)
         if rendering.coarse is not None:
-            self._batches.set_coarse(rendering.coarse)
+            self._batches.set_coarse(rendering.coarse.repeat_interleave(self._split, -1) / self._split)
         for views in self.views:
             views.field_queries += renderer.samples_per_ray * rendering.opacity[0].numel()
         return rendering.images
 
     def _distances(self) -> tuple[Float[Tensor, "scenes"], Float[Tensor, "scenes"]]:
         """Return the mean squared errors of the last targets and of the input view."""
-        source = self._render(self.field.cameras[:, None])
-        return _mse(self._render(self.cameras), self._last_targets), _mse(source[:, 0], self._source)
+        source = self._render(self.field.cameras[:, None], self._renderer)
+        return _mse(self._render(self.cameras, self._renderer), self._last_targets), _mse(source[:, 0], self._source)
 
 
 def _mse(images: Float[Tensor, "scenes *rest"], others: Float[Tensor, "scenes *rest"]) -> Float[Tensor, "scenes"]:

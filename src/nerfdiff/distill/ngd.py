@@ -17,6 +17,8 @@ from nerfdiff.utils.images import to_signed, to_unit
 
 SCHEDULES = ("snr", "constant", "linear")
 COMPARISONS = ("current", "last")
+AT_FULL_GUIDANCE = ("everything", "fit", "nothing")
+"""Choices of what is computed where renderings take the place of the denoised images."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,10 @@ class Guidance:
             return torch.where(numerator >= alpha**2, float(self.gamma > 0), numerator / (alpha**2).clamp_min(1e-12))
         return (self.gamma * (t if self.schedule == "linear" else torch.ones_like(t))).clamp(0, 1)
 
+    def replaces(self, t: Float[Tensor, ""]) -> bool:
+        """Return true if at time t the guided images are the renderings, whatever the denoised ones are."""
+        return self.compare == "current" and bool(self.weight(t) == 1)
+
     def __call__(
         self,
         x0: Float[Tensor, "views 3 height width"],
@@ -73,8 +79,10 @@ class Guidance:
         Returns:
             x̃0, clamped to [-1, 1], which a difference to the last step's image could leave.
         """
-        compared = x0 if self.compare == "current" else last
-        return (x0 - self.weight(t) * (compared - rendered)).clamp(-1, 1)
+        weight = self.weight(t)
+        # the first of the two is exact at both ends of w
+        guided = x0.lerp(rendered, weight) if self.compare == "current" else x0 - weight * (last - rendered)
+        return guided.clamp(-1, 1)
 
 
 @from_keys(sampling=SamplerSettings)
@@ -87,14 +95,29 @@ class NGDTeacher:
         sampling: the guided images take the place of the denoised ones in any sampler.
         guidance: towards the field's renderings.
         condition: the rendering that conditions the CDM: the `first`, of the single-image NeRF, or the `current` one.
+        at_full_guidance: what is computed in steps whose guided images are the renderings (w = 1): `everything`; `fit`,
+            the inner steps without the denoiser, whose images would not be used (the same result, where deep levels
+            are computed at each call); or `nothing`: fitting a field to its own renderings only blurs it.
 
     Raises:
-        ConfigError: another `condition`, or a sampler, spacing, times or eta that cannot be.
+        ConfigError: another `condition` or `at_full_guidance`, or a sampler, spacing, times or eta that cannot be.
     """
 
     follows_field = True
 
-    def __init__(self, views: VirtualViews, steps: int, sampling: SamplerSettings, guidance: Guidance, condition: str):
+    def __init__(
+        self,
+        views: VirtualViews,
+        steps: int,
+        sampling: SamplerSettings,
+        guidance: Guidance,
+        condition: str,
+        at_full_guidance: str = "fit",
+    ):
+        if at_full_guidance not in AT_FULL_GUIDANCE:
+            known = ", ".join(AT_FULL_GUIDANCE)
+            raise ConfigError(f"teacher.at_full_guidance={at_full_guidance!r}: choose {known}")
+        self.at_full_guidance = at_full_guidance
         self.views, self.steps, self.guidance = views, steps, guidance
         self.sampler, self._deep = sampling.begin(), views.deep_features(sampling.deep)
         self.on_current = uses_current_rendering(condition)
@@ -107,16 +130,20 @@ class NGDTeacher:
         # Algorithm 1 begins with the renderings, noised: for t_max = 1 that is noise alone
         self._z = add_noise(self._last, views.noise(), *alpha_sigma(self.times[0]))
 
-    def targets(self, step: int, rendered: Images) -> Images:
+    def targets(self, step: int, rendered: Images) -> Images | None:
         t, t_next = self.times[step], self.times[step + 1]
-        # denoise
-        condition = rendered if self.on_current else None
-        x0 = self.views.denoise(self._z, t.expand(len(self._z)), condition, self._deep)
-        # guide
-        self._last = self.guidance(x0, to_signed(rendered), self._last, t)
         recorded = self._host_times[step]
         self.t, self.weight = float(recorded), float(self.guidance.weight(recorded))
+        replaced = self.guidance.replaces(recorded)
+        if replaced and self.at_full_guidance != "everything":
+            self._last = to_signed(rendered).clamp(-1, 1)
+        else:
+            # denoise
+            condition = rendered if self.on_current else None
+            x0 = self.views.denoise(self._z, t.expand(len(self._z)), condition, self._deep)
+            # guide
+            self._last = self.guidance(x0, to_signed(rendered), self._last, t)
         # step to the next time
         noise = self.views.noise() if self.sampler.needs_noise else None
         self._z = self.sampler.step(self._z, self._last, t, t_next, noise)
-        return to_unit(self._last)
+        return None if replaced and self.at_full_guidance == "nothing" else to_unit(self._last)

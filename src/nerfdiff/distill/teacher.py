@@ -23,8 +23,8 @@ class Teacher(Protocol):
     weight: float | None
     """Weight of guidance at the last step, where there is one."""
 
-    def targets(self, step: int, rendered: Images | None) -> Images:
-        """Return images in [0, 1] to fit the field to.
+    def targets(self, step: int, rendered: Images | None) -> Images | None:
+        """Return images in [0, 1] to fit the field to; None where it stays as it is, its renderings being the targets.
 
         Args:
             step: from 0 to `steps` - 1, each once, in order.

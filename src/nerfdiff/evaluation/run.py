@@ -15,6 +15,7 @@ from nerfdiff.checkpoint import LoadedModel, load_model
 from nerfdiff.compilation import compile_unets
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.datamodule import SceneDataModule
+from nerfdiff.diffusion.denoiser import cast_products
 from nerfdiff.diffusion.layout import channels_last
 from nerfdiff.distill.strategy import Strategy
 from nerfdiff.model import NerfDiff
@@ -278,6 +279,8 @@ def _run(
     in_pixels = channels_last(cfg.channels_last, device, cfg.compile != "none")
     if in_pixels:
         model.to(memory_format=torch.channels_last)
+    if precision != "32-true":
+        cast_products(model.denoiser, torch.bfloat16)
     compile_unets(model, cfg.compile, cfg.paths.compiled_dir)
     spent_on = [hardware(device), cfg.threads, cfg.scenes_at_once, model.renderer.chunk, in_pixels]
     settings = RunSettings.of(cfg)

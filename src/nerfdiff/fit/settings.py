@@ -1,8 +1,9 @@
 """Settings of the fit of a field to images of a scene at test time."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from nerfdiff.render.renderer import Renderer
 from nerfdiff.utils.errors import ConfigError
 
 DECAYS = {
@@ -33,9 +34,11 @@ class FitSettings:
             their samples at once. Kept weights take 2 bytes for each bin of each ray of all views. Where teachers do
             not follow the field, nothing is rendered between inner steps, and weights are computed at every step.
         cuda_graphs: record an inner step once and replay it, on a GPU.
+        guidance_uniform_samples, guidance_importance_samples: per ray, where the field is rendered for the teacher;
+            None, or more than the model has: the model's.
 
     Raises:
-        ConfigError: another `lr_decay` or `coarse`, no rays, or negative steps.
+        ConfigError: another `lr_decay` or `coarse`, no rays, negative steps, or no uniform samples.
     """
 
     inner_steps: int
@@ -48,6 +51,8 @@ class FitSettings:
     source_tolerance: float
     coarse: str
     cuda_graphs: bool
+    guidance_uniform_samples: int | None = None
+    guidance_importance_samples: int | None = None
 
     def __post_init__(self):
         if self.rays < 1 or self.inner_steps < 0:
@@ -56,3 +61,14 @@ class FitSettings:
             raise ConfigError(f"strategy.lr_decay={self.lr_decay!r}: choose {', '.join(DECAYS)}")
         if self.coarse not in COARSE:
             raise ConfigError(f"strategy.coarse={self.coarse!r}: choose {', '.join(COARSE)}")
+        for name, least in (("uniform", 1), ("importance", 0)):
+            key = f"guidance_{name}_samples"
+            if (count := getattr(self, key)) is not None and count < least:
+                raise ConfigError(f"strategy.{key}={count} must be at least {least}, or null for the model's")
+
+    def guidance(self, renderer: Renderer) -> Renderer:
+        """Return the renderer of the images for the teacher."""
+        given = self.guidance_uniform_samples, self.guidance_importance_samples
+        own = renderer.uniform_samples, renderer.importance_samples
+        uniform, importance = (most if n is None else min(n, most) for n, most in zip(given, own, strict=True))
+        return replace(renderer, uniform_samples=uniform, importance_samples=importance)

@@ -16,6 +16,7 @@ from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.field import Field, TriplaneField
 from nerfdiff.render.agreement import Probe, disagreement, in_any_order
 from nerfdiff.render.reference_gradients import reference_gradients
+from nerfdiff.render.trusted import is_trusted, trust
 from nerfdiff.utils.errors import ConfigError
 
 log = logging.getLogger(__name__)
@@ -218,6 +219,10 @@ def _distrust(renderer, field: TriplaneField, rays: Rays, jitter, coarse, ordere
     recording = device.type == "cuda" and torch.cuda.is_current_stream_capturing()
     if device.type not in _COMPARED or recording or (*way, needs) in _trusted:
         return None
+    of = field.triplane.planes.shape[2], renderer.uniform_samples, *way[1:]
+    if is_trusted(device, str((*of, needs))):
+        _trusted.add((*way, needs))
+        return None
     plain, values = replace(renderer, backend="torch"), attrgetter("rgb", "opacity", "depth")
     with in_any_order():
         probe = Probe.like(field, rays, jitter, coarse, renderer.samples_per_ray, needs)
@@ -231,7 +236,9 @@ def _distrust(renderer, field: TriplaneField, rays: Rays, jitter, coarse, ordere
     if reason is not None:
         _failures[kind] = reason
         return reason
-    _trusted.update({(*way, needs), (*way, (False, False, False))})
+    passed = {needs, (False, False, False)}
+    _trusted.update((*way, own) for own in passed)
+    trust(device, [str((*of, own)) for own in passed])
     return None
 
 

@@ -26,7 +26,8 @@ from torch.utils.tensorboard import SummaryWriter
 
 from nerfdiff.averages import PowerAverages
 from nerfdiff.cameras import Cameras
-from nerfdiff.checkpoint import LoadedModel, export_model, load_model
+from nerfdiff.checkpoint import DTYPES, LoadedModel, export_model, load_model
+from nerfdiff.compilation import compile_unets
 from nerfdiff.data.cache import CachedReader
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.data.views import spread
@@ -116,18 +117,31 @@ class FrozenField:
         sources: so many first views of a scene.
         batch: source views encoded at once.
         autocast: the context of the forward pass.
+        every_seconds: between lines on how far it is.
     """
 
     @torch.no_grad()
     def __init__(
-        self, model: NerfDiff, scenes: ResidentScenes, sources: int, batch: int, autocast: AbstractContextManager
+        self,
+        model: NerfDiff,
+        scenes: ResidentScenes,
+        sources: int,
+        batch: int,
+        autocast: AbstractContextManager,
+        every_seconds: float = math.inf,
     ):
         count, views = scenes.pixels.shape[:2]
         device = scenes.pixels.device
         pairs = torch.cartesian_prod(torch.arange(count), torch.arange(min(sources, views))).to(device)
         everything = torch.arange(views, device=device)
         rendered, context = [], []
-        for scene, source in (part.unbind(1) for part in pairs.split(batch)):
+        began = said = time.monotonic()
+        for number, (scene, source) in enumerate(part.unbind(1) for part in pairs.split(batch)):
+            if number and (now := time.monotonic()) - said > every_seconds:
+                share = number * batch / len(pairs)
+                left = (now - began) * (1 - share) / share
+                log.info("renderings of the frozen field: %.0f %% made, %.0f s left", 100 * share, left)
+                said = now
             own, all_views = scenes.cameras(scene, source, everything.expand(len(scene), -1))
             with autocast:
                 encoding = model.encode_images(scenes.images(scene, source), own, scenes.near[scene], scenes.far[scene])
@@ -304,8 +318,10 @@ def train_resident(cfg: DictConfig) -> Path:
         model.encoder.requires_grad_(False)
         model.decoder.requires_grad_(False)
         began = time.monotonic()
-        frozen = FrozenField(model, scenes, sources, cfg.encoded_at_once, autocast)
+        frozen = FrozenField(model, scenes, sources, cfg.encoded_at_once, autocast, cfg.every_seconds)
         log.info("%d renderings kept, %.1f s", frozen.rendered[..., 0, 0, 0].numel(), time.monotonic() - began)
+    compile_unets(model, cfg.compile, cfg.paths.compiled_dir)
+    torch.backends.cudnn.benchmark = cfg.benchmark
     step = Step(
         model, scenes, table, data.batch_size, frozen, plain(cfg.optimizer), cfg.gradient_clip_val, cfg.seed, autocast
     )
@@ -331,7 +347,7 @@ def train_resident(cfg: DictConfig) -> Path:
         stability={},
         trained_on=[*begun.trained_on, seen],
     )
-    return export_model(loaded, Path(cfg.paths.output_dir) / "model", torch.float32)
+    return export_model(loaded, Path(cfg.paths.output_dir) / "model", DTYPES[cfg.dtype])
 
 
 def _check(cfg: DictConfig) -> None:
@@ -340,6 +356,8 @@ def _check(cfg: DictConfig) -> None:
         raise ConfigError(f"part={cfg.part}: choose cdm (the field stays as it is) or joint")
     if cfg.precision not in ("bf16-mixed", "32-true"):
         raise ConfigError(f"precision={cfg.precision}: choose bf16-mixed or 32-true")
+    if cfg.dtype not in DTYPES:
+        raise ConfigError(f"dtype={cfg.dtype}: choose {', '.join(DTYPES)}")
     if cfg.optimizer.decay not in ("none", "cosine"):
         raise ConfigError(f"optimizer.decay must be none or cosine, got {cfg.optimizer.decay!r}")
     if cfg.average not in cfg.lengths:

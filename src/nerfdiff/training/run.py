@@ -172,6 +172,8 @@ def build_trainer(cfg: DictConfig) -> Trainer:
     options: dict[str, Any] = {}
     if cfg.trainer.precision == "auto":
         options["precision"] = auto_precision(cfg.trainer.accelerator)
+    if cfg.trainer.benchmark == "auto":
+        options["benchmark"] = not cfg.trainer.deterministic
     logger = cfg.get("logger")
     # Without a logger there is nowhere to write the learning rate to.
     wanted = {name: node for name, node in cfg.callbacks.items() if logger or name != "learning_rate"}

@@ -255,6 +255,9 @@ def test_alien_views_take_the_places_of_some_targets(views, share, replaced):
     assert (teacher.steps, teacher.t, teacher.follows_field) == (3, None, False)
     targets = teacher.targets(0, None)
     assert [view for view in range(views) if targets[view].any()] == replaced and not own.any()
+    teacher.teacher.targets = lambda step, rendered: None  # the renderings are the targets, but for the alien views
+    targets = teacher.targets(0, torch.full_like(own, 0.5))
+    assert [view for view in range(views) if targets[view].eq(1).all()] == replaced
 
 
 def test_alien_views_are_of_the_scene_before_and_need_one():

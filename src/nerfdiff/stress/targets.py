@@ -21,7 +21,8 @@ class AlienViews:
         return getattr(self.teacher, name)
 
     def targets(self, step: int, rendered: Images | None) -> Images:
-        images = self.teacher.targets(step, rendered).clone()
+        own = self.teacher.targets(step, rendered)
+        images = (rendered if own is None else own).clone()  # None: the field's renderings are the targets
         replaced = replaced_views(len(images), self.share)
         chosen = [number % len(self.alien) for number in range(len(replaced))]
         images[replaced] = self.alien[chosen].to(images)

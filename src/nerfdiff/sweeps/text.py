@@ -108,7 +108,7 @@ def _number(value: float | None, column: Column, sign: str = "") -> str | None:
 
 
 def _names(fields: Sequence[str]) -> str | None:
-    return ", ".join(column.heading.rstrip(" ↑↓") for column in all_columns() if column.field in fields) or None
+    return ", ".join(column.heading.rstrip(" ↑↓†") for column in all_columns() if column.field in fields) or None
 
 
 def _share(value: float | None) -> str | None:

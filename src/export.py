@@ -1,4 +1,4 @@
-"""Weights alone, for sharing: `python src/export.py ckpt=runs/demo_checkpoint out=assets/demo dtype=float16`."""
+"""A model's weights for sharing, or a scene for other programs: `python src/export.py field=… format=glb,ply,mp4`."""
 
 from nerfdiff.commands.export import main
 

@@ -19,6 +19,8 @@ from nerfdiff.distill.none import SingleImageNeRF
 from nerfdiff.distill.sds import SDSTeacher
 from nerfdiff.distill.stochastic import StochasticTeacher
 from nerfdiff.distill.virtual_views import VirtualViews
+from nerfdiff.fit.confidence import Confidence
+from nerfdiff.fit.objective import Objective
 from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.fit.settings import FitSettings
 from nerfdiff.model import NerfDiff
@@ -143,19 +145,34 @@ TEACHERS = {
 def test_guide_and_inner_step(teacher, coarse, backend):
     if coarse == "refresh" and teacher not in ("ngd", "sds"):
         pytest.skip("does not follow the field")
+    guide_and_step(TEACHERS[teacher], coarse, backend)
+
+
+@BACKENDS
+@pytest.mark.parametrize("teacher", ["ngd", "direct", "sds, fresh"])
+def test_a_step_with_all_parts_asks_nothing_of_the_host(teacher, backend):
+    """Patches with a perceptual loss, confidence, regularisers, the average of weights, fewer views."""
+    fresh = {"sds, fresh": lambda own: SDSTeacher(own, 1, 0.98, 0.02, "first", "sigma2", 1)}
+    sharp = Objective(SIDE, "l1", 0.1, 0.01, 0.01, Confidence(0.1))
+    guide_and_step((TEACHERS | fresh)[teacher], "refresh", backend, sharp, average=1.0, views_last=1)
+
+
+def guide_and_step(teacher, coarse: str, backend: str, objective: Objective | None = None, **more) -> None:
+    """One step of the teacher and one inner step, with nothing brought from the host."""
     with fake_cuda() as gpu, bf16():
         model, scene = made(sizes(backend)).eval().requires_grad_(False), views(1, 1)
         encoding = model.encode(scene)
-        virtual = VirtualViews(model, encoding, cameras(1, 2).to(DEVICE), 4, (0,))
+        virtual = VirtualViews(model, encoding, cameras(1, 2).to(DEVICE), 4, (0,), more.get("views_last"))
         field = RefinedField(encoding.triplane, model.decoder)
-        fit = FitSettings(1, 16, 5e-2, 1e-4, "linear", True, 1.0, 10.0, coarse, False)
-        module = NGDModule(field, [virtual], [TEACHERS[teacher](virtual)], fit, [(0,)])
+        fit = FitSettings(1, SIDE**2, 5e-2, 1e-4, "linear", True, 1.0, 10.0, coarse, False, **more)
+        module = NGDModule(field, [virtual], [teacher(virtual)], fit, [(0,)], objective)
         module._device = DEVICE
         optimizer = module.configure_optimizers()
         module.optimizers = lambda: SimpleNamespace(optimizer=optimizer)
         module.on_train_start()
         module.on_train_batch_start(0, 0)
         gpu.copies.clear()
-        module.training_step(0, 0)
+        last = module.steps - 1  # where views are dropped, all but one are
+        module.training_step(last, last)
         assert field.planes.grad.device == DEVICE and all(p.grad is not None for p in field.parameters())
         assert not gpu.copies and bool(gpu.rendering.calls) == (backend == "auto")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from nerfdiff.cli import CONF, check_overrides, load_config
-from nerfdiff.quoting import quote_values
+from nerfdiff.quoting import gather_lists, quote_values
 from nerfdiff.utils.errors import ConfigError
 
 PROJECT = Path(__file__).parents[1]
@@ -67,6 +67,7 @@ def wrong_commands(text: str) -> list[str]:
             wrong.append(path)
         elif path.startswith("src/") and OWN_CONFIG not in words:
             try:
+                words = gather_lists(Path(path).stem, words)
                 check_overrides(Path(path).stem, quote_values(words))
                 if not {"-m", "--multirun"} & set(words) and not any("," in word for word in words):
                     load_config(Path(path).stem, [word for word in words if "=" in word])

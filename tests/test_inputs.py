@@ -10,7 +10,8 @@ from nerfdiff.inputs import ASSETS, WEIGHTS, find_weights
 from nerfdiff.utils.errors import CheckpointError, UserError
 
 INPUTS = {"distill": ["ckpt", "image", "picture.mask", "data.root"], "evaluate": ["ckpt", "data.root"],
-          "export": ["ckpt"], "train": ["data.root"], "inspect_data": ["data.root"], "chart": ["results"]}  # fmt: skip
+          "export": ["ckpt", "fields"], "train": ["data.root"], "inspect_data": ["data.root"],
+          "chart": ["results"]}  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -26,7 +27,7 @@ def empty_folder(tmp_path, monkeypatch):
         ("distill", [], "ckpt must be given: add ckpt=<value>"),
         ("distill", ["sweep=strategies"], "ckpt must be given"),
         ("evaluate", ["-m", "seed=0,1"], "ckpt must be given"),
-        ("export", ["out=x"], "ckpt must be given"),
+        ("export", ["field=gone.safetensors"], "gone.safetensors: no such file; name a field.safetensors"),
         ("distill", ["ckpt=dmo", "image=car.png"], "ckpt=dmo is neither a file nor a folder of a run"),
         ("export", ["ckpt=scenes", "out=x"], "Shipped models: demo"),
         ("distill", ["sweep=views", "ckpt=dmo"], "ckpt=dmo is neither"),

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from nerfdiff.cli import load_config, prepare_arguments
-from nerfdiff.quoting import parse_override, quote_values
+from nerfdiff.quoting import gather_lists, parse_override, quote_values
 from nerfdiff.utils.errors import ConfigError
 
 NAMES = ["photo (1).png", "été.png", "日本.png", "car~1.png", "a=b.png", "it's.png", "car#2.png", "[a](1).png", "2024",
@@ -70,3 +70,21 @@ def test_what_cannot_be_read_is_named_with_how_to_write_it(words, message):
     with pytest.raises(ConfigError) as error:
         prepare_arguments("distill", [], words)
     assert message in str(error.value)
+
+
+def listed(command: str, *words: str) -> dict[str, list]:
+    gathered = [parse_override(word) for word in quote_values(gather_lists(command, list(words)))]
+    return {override.key_or_group: override.value() for override in gathered}
+
+
+def test_lists_are_written_with_commas_and_are_no_sweeps(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in (*NAMES, "a,b.safetensors"):
+        Path(name).touch()
+        assert listed("export", f"field={name}", "format=glb,ply") == {"fields": [name], "format": ["glb", "ply"]}
+    assert listed("export", "field=x.safetensors,y z.safetensors") == {"fields": ["x.safetensors", "y z.safetensors"]}
+    assert listed("export", "field=[x,y]", "format=[glb]") == {"fields": ["x", "y"], "format": ["glb"]}
+    assert listed("picture", *NAMES, "elevation=8") == {"images": NAMES, "elevation": 8}
+    assert listed("picture", "image=a.jpg,b.jpg") == {"images": ["a.jpg", "b.jpg"]}
+    assert gather_lists("train", ["field=triplane,pixelnerf", "-m"]) == ["field=triplane,pixelnerf", "-m"]
+    assert load_config("export", ["format=ply"]).format == ["ply"]

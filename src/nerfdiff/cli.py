@@ -25,7 +25,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from nerfdiff.inputs import CHECKOUT, CONF, check_inputs, check_output
 from nerfdiff.limits import check_limit, check_limits
 from nerfdiff.noise import quieten
-from nerfdiff.quoting import parse_override, quote_values
+from nerfdiff.quoting import gather_lists, parse_override, quote_values
 from nerfdiff.stopping import Stopped, leave, on_signals, stop
 from nerfdiff.utils.errors import ConfigError, UserError, is_out_of_memory
 from nerfdiff.utils.hashes import sha256_values
@@ -187,7 +187,7 @@ def load_config(config_name: str, overrides: list[str]) -> DictConfig:
     Raises:
         ConfigError: an override names no key, or its value is of the wrong kind, or a number that no run can have.
     """
-    overrides = quote_values(overrides)
+    overrides = quote_values(gather_lists(config_name, overrides))
     check_overrides(config_name, overrides)
     config = _compose(config_name, overrides)
     check_limits(config)
@@ -203,7 +203,7 @@ def prepare_arguments(config_name: str, inputs: Sequence[str], arguments: list[s
     options = {word.partition("=")[0] for word in arguments if word.startswith("-")}
     if not options.isdisjoint(COMPLETING):
         return arguments
-    arguments = quote_values(arguments)
+    arguments = quote_values(gather_lists(config_name, arguments))
     check_overrides(config_name, arguments)
     if not options.isdisjoint((*SHOWING, *OTHER_CONFIG)):
         return arguments

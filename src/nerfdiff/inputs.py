@@ -54,8 +54,8 @@ def check_inputs(
     """Refuse a composed config whose checkpoint, picture, dataset or results are not there.
 
     Args:
-        keys: what the command reads, among `ckpt`, `init`, `image`, `picture.mask`, `data.root` and `results`. With an
-            `image` no dataset is read.
+        keys: what the command reads, among `ckpt`, `init`, `image`, `images`, `picture.mask`, `fields`, `data.root` and
+            `results`. With an `image` no dataset is read.
         swept: keys that every job of a sweep sets for itself, which are the jobs' to check.
         only: keys whose files are looked for; None is all.
 
@@ -75,11 +75,17 @@ def check_inputs(
             for place in [value] if isinstance(value, str) else value:
                 if not Path(place).exists():
                     raise DataError(f"results={place}: no such file or folder; name folders of runs, or their files")
-        elif not Path(value).is_file():
-            what = "no such file"
-            if Path(value).exists():
-                what = "is a folder" if Path(value).is_dir() else "is no ordinary file"
-            raise DataError(f"{key}={value}: {what}; name a picture")
+        else:
+            for file in [value] if isinstance(value, str) else value:
+                _check_file(key, file, "name a field.safetensors" if key == "fields" else "name a picture")
+
+
+def _check_file(key: str, file: str, instead: str) -> None:
+    if not Path(file).is_file():
+        what = "no such file"
+        if Path(file).exists():
+            what = "is a folder" if Path(file).is_dir() else "is no ordinary file"
+        raise DataError(f"{key}={file}: {what}; {instead}")
 
 
 def check_output(cfg: DictConfig) -> None:

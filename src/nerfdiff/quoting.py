@@ -3,6 +3,8 @@
 import os
 import re
 from collections.abc import Sequence
+from itertools import pairwise
+from os.path import isfile
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, Quote, QuotedString
@@ -10,6 +12,15 @@ from hydra.errors import HydraException
 
 PATHS = re.compile(r"ckpt|init|kept_renderings|image|mask|out|root|results|run|dir|\w+_dir|\w+_weights")
 """Last parts of the keys that take paths."""
+
+LISTS: dict[str, dict[str, str]] = {
+    "export": {"field": "fields", "format": "format"},
+    "picture": {"image": "images", "images": "images", "format": "format"},
+}
+"""By commands: words that take a list, and their keys, which differ where a group of configs has the word."""
+
+BARE: dict[str, str] = {"picture": "images"}
+"""By commands: the key that words without a key are values of."""
 
 
 def quote_values(words: Sequence[str]) -> list[str]:
@@ -20,6 +31,25 @@ def quote_values(words: Sequence[str]) -> list[str]:
     are quoted one by one. What is quoted already is kept.
     """
     return [_quote_word(word) for word in words]
+
+
+def gather_lists(command: str, words: Sequence[str]) -> list[str]:
+    """Write the values of `LISTS` and `BARE` as Hydra's lists: `format=glb,ply` is no sweep there."""
+    lists, bare = LISTS.get(command, {}), BARE.get(command)
+    found: dict[str, list[str]] = {}
+    others = []
+    for before, word in pairwise(["", *words]):
+        key, equals, value = word.partition("=")
+        if bare and not word.startswith(("-", "~")) and not before.startswith("-") and (not equals or isfile(word)):
+            found.setdefault(bare, []).append(word)
+        elif key not in lists or not equals:
+            others.append(word)
+        elif not (whole := os.path.exists(os.path.expanduser(value))) and value[:1] in ("[", "'", '"'):
+            others.append(f"{lists[key]}={value}")
+        else:
+            found.setdefault(lists[key], []).extend([value] if whole else filter(None, _split(value)))
+    expanded = {key: [_literal(os.path.expanduser(value)) for value in values] for key, values in found.items()}
+    return [*(f"{key}=[{','.join(values)}]" for key, values in expanded.items()), *others]
 
 
 def parse_override(word: str) -> Override | None:

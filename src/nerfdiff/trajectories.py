@@ -1,6 +1,7 @@
 """A circle of cameras around what a set of cameras looks at, estimated from the cameras alone."""
 
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -43,18 +44,63 @@ def look_at(centres: Float[Tensor, "n 3"], point: Float[Tensor, "3"], up: Float[
     return c2w
 
 
+@dataclass(frozen=True)
+class Upright:
+    """How a scene stands in the space of its input camera.
+
+    Args:
+        point: what cameras look at.
+        up: a unit vector.
+    """
+
+    point: Float[Tensor, "3"]
+    up: Float[Tensor, "3"]
+
+    @staticmethod
+    def seen_by(cameras: Cameras) -> "Upright":
+        """Estimate it from level cameras [n] that look at one point from at least two sides."""
+        return Upright(look_at_point(cameras), up_direction(cameras))
+
+    @staticmethod
+    def assumed(distance: float, elevation: float) -> "Upright":
+        """Take the input camera to look at what is `distance` before it, down from `elevation` degrees."""
+        tilt = math.radians(elevation)  # the input camera stands at the origin and looks along z, its y pointing down
+        return Upright(torch.tensor([0.0, 0.0, distance]), torch.tensor([0.0, -math.cos(tilt), -math.sin(tilt)]))
+
+    def to(self, *args, **kwargs) -> "Upright":
+        """Move or cast as `Tensor.to`."""
+        return Upright(self.point.to(*args, **kwargs), self.up.to(*args, **kwargs))
+
+    def around(self, source: Cameras, azimuth: Float[Tensor, "n"], elevation: Float[Tensor, "n"] | None) -> Cameras:
+        """Cameras [n] that look at the point from the distance of the camera `source` [1], with its lens.
+
+        Args:
+            azimuth: degrees, anticlockwise seen from above; 0 is the source's.
+            elevation: degrees above the horizon; None: the source's.
+        """
+        arm = source.centres[0] - self.point
+        height = arm @ self.up
+        across = arm - height * self.up
+        if across.norm() < 1e-6 * arm.norm():  # straight above: the image's lower edge is the front
+            below = source.c2w[0, :3, 1]
+            across = below - (below @ self.up) * self.up
+        front = across / across.norm()
+        angle = torch.deg2rad(azimuth)[:, None]
+        direction = angle.cos() * front + angle.sin() * torch.linalg.cross(self.up, front)
+        if elevation is None:
+            centres = self.point + height * self.up + (arm - height * self.up).norm() * direction
+        else:
+            angle = torch.deg2rad(elevation)[:, None]
+            centres = self.point + arm.norm() * (angle.cos() * direction + angle.sin() * self.up)
+        n = len(azimuth)
+        return Cameras(look_at(centres, self.point, self.up), source.K.expand(n, 3, 3), source.height, source.width)
+
+
 def orbit(source: Cameras, others: Cameras, frames: int) -> Cameras:
     """A full turn from the source camera around what all cameras look at, at the source's height and distance.
 
     Args:
         source: [1]; others: [n], in the same space.
     """
-    everyone = Cameras.join([source, others])
-    point, up = look_at_point(everyone), up_direction(everyone)
-    arm = source.centres[0] - point
-    height = (arm @ up) * up
-    across = arm - height
-    angles = torch.arange(frames, device=arm.device) / frames * 2 * math.pi
-    turned = angles.cos()[:, None] * across + angles.sin()[:, None] * torch.linalg.cross(up, across)
-    c2w = look_at(point + height + turned, point, up)
-    return Cameras(c2w, source.K.expand(frames, 3, 3), source.height, source.width)
+    azimuth = torch.arange(frames, device=source.K.device) / frames * 360
+    return Upright.seen_by(Cameras.join([source, others])).around(source, azimuth, None)

@@ -45,6 +45,15 @@ def test_weights_stay_between_0_and_1_from_one_end_of_t_to_the_other(schedule):
         assert (gamma > 0) == bool(weights.max() > 0)
 
 
+@pytest.mark.parametrize("schedule", ["snr", "constant", "linear"])
+def test_below_a_time_there_is_no_guidance_and_above_it_is_as_without(schedule):
+    every, late = Guidance(schedule, 0.7, "current"), Guidance(schedule, 0.7, "current", t_min=0.4)
+    for t in torch.linspace(0, 1, 11, dtype=torch.float64):
+        assert late.weight(t) == (every.weight(t) if t >= 0.4 else 0)
+    _, x0, rendered, last = images(1)
+    assert torch.equal(late(x0, rendered, last, torch.tensor(0.3)), x0)
+
+
 @pytest.mark.parametrize("compare", ["current", "last"])
 @pytest.mark.parametrize("gamma", [0.3, 1.0])
 def test_guided_images_stay_images(compare, gamma):
@@ -59,6 +68,11 @@ def test_guided_images_stay_images(compare, gamma):
 
 
 def test_unknown_settings_are_refused_with_the_known_ones():
-    for arguments in (("cosine", 1.0, "current"), ("snr", 1.0, "first"), ("snr", -1.0, "current")):
+    for arguments in (
+        ("cosine", 1.0, "current"),
+        ("snr", 1.0, "first"),
+        ("snr", -1.0, "current"),
+        ("snr", 1.0, "current", 2.0),
+    ):
         with pytest.raises(ConfigError, match="guidance"):
             Guidance(*arguments)

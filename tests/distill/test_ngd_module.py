@@ -15,6 +15,8 @@ from nerfdiff.distill.module import NGDModule
 from nerfdiff.distill.ngd import Guidance, NGDTeacher
 from nerfdiff.distill.sds import SDSTeacher
 from nerfdiff.distill.stochastic import StochasticTeacher
+from nerfdiff.fit.confidence import Confidence
+from nerfdiff.fit.objective import Objective
 from nerfdiff.fit.ray_batches import RayBatches
 from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.fit.settings import COARSE
@@ -125,6 +127,71 @@ def test_a_scene_does_not_depend_on_its_company(teacher, fit_source, coarse):
         for step, expected in zip(together.trace(number), alone.trace(0), strict=True):
             for name, value in dataclasses.asdict(expected).items():
                 assert getattr(step, name) == (value if value is None else pytest.approx(value, rel=1e-3))
+
+
+SHARP = {
+    "objective": Objective(8, "l1", 0.1, 0.01, 0.01, Confidence(0.2)),
+    "average": 0.5,
+    "views_last": 2,
+    "fit_source": True,
+    "coarse": "refresh",
+}
+
+
+@pytest.mark.parametrize("teacher", ["ngd, current", "direct", "sds, fresh"])
+def test_with_all_parts_a_scene_does_not_depend_on_its_company(teacher):
+    net = model(conditioning={"residual_std": 0.2}).requires_grad_(False)
+    fresh = lambda views: SDSTeacher(views, 1, 1.0, 0.02, "first", "sigma2", 1)  # noqa: E731
+    method = distillation((TEACHERS | {"sds, fresh": fresh})[teacher], inner_steps=2, lr_planes=1e-3, **SHARP)
+    together = method.distil(net, [scene("a"), scene("b")], seed=0)
+    for number, own in enumerate((scene("a"), scene("b"))):
+        alone, field = method.distil(net, [own], seed=0), together.field.alone(number)
+        torch.testing.assert_close(field.planes, alone.field.planes, atol=1e-4, rtol=1e-4)
+        assert together.views[number].field_queries == alone.views[0].field_queries
+        assert together.views[number].denoiser_calls == alone.views[0].denoiser_calls
+        assert together.statuses[number] == alone.statuses[0]
+
+
+def test_networks_of_the_loss_are_no_part_of_what_is_fitted_saved_or_averaged(monkeypatch):
+    net = model().requires_grad_(False)
+    plain, sharp = (distillation(TEACHERS["ngd"], inner_steps=1, **options) for options in ({}, SHARP))
+    fitted = []
+    configure = NGDModule.configure_optimizers
+
+    def noted(self):
+        made = configure(self)
+        fitted.append([value.shape for group in made[0][0].param_groups for value in group["params"]])
+        return made
+
+    monkeypatch.setattr(NGDModule, "configure_optimizers", noted)
+    before, after = (method.distil(net, [scene()], 0) for method in (plain, sharp))
+    assert fitted[0] == fitted[1]
+    for module in (after, after.field):
+        assert not any("net" in name for name, _ in module.named_modules())
+    assert {n: v.shape for n, v in before.state_dict().items()} == {n: v.shape for n, v in after.state_dict().items()}
+    assert after._average.snapshot().keys() == dict(after.field.named_parameters()).keys()
+
+
+@pytest.mark.parametrize(("share", "averaged"), [(0.25, 1), (0.5, 2), (1.0, 4)])
+def test_what_is_kept_is_the_mean_over_the_last_share_of_the_steps(share, averaged, monkeypatch):
+    seen, keep = [], NGDModule._keep_finite
+
+    def noted(self, losses, targets):
+        keep(self, losses, targets)
+        seen.append(self.field.snapshot())
+
+    monkeypatch.setattr(NGDModule, "_keep_finite", noted)
+    method = distillation(TEACHERS["ngd"], inner_steps=1, lr_planes=1e-3, average=share)
+    module = method.distil(model().requires_grad_(False), [scene()], seed=0)
+    assert module.statuses == ["ok"] and len(seen) == 4
+    for name, value in module.field.named_parameters():
+        torch.testing.assert_close(value, torch.stack([one[name] for one in seen[-averaged:]]).mean(0))
+
+
+def test_settings_of_the_fit_that_cannot_be_are_refused():
+    for options, message in (({"average": 1.5}, "strategy.average=1.5"), ({"views_last": 0}, "strategy.views_last=0")):
+        with pytest.raises(ConfigError, match=message):
+            distillation(TEACHERS["ngd"], **options)
 
 
 def test_a_scene_that_fails_leaves_the_others_alone():
@@ -365,7 +432,7 @@ def test_one_view_and_one_ray_give_numbers(gamma):
 class Failing:
     """The same images until a step, and from there on what is no image."""
 
-    t = weight = None
+    t = weight = view_weights = None
     follows_field, steps = False, 6
 
     def __init__(self, images, at, value=float("nan")):

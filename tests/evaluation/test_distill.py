@@ -356,10 +356,13 @@ def test_processes_that_cannot_be_had_are_refused(setting, data, run, tmp_path):
         distill(config(data, run, tmp_path, setting))
 
 
-@pytest.mark.parametrize("strategy", ["none", "cdm", "ngd", "direct", "sds", "stochastic", "ngd_current"])
+METHODS = ["none", "cdm", "ngd", "direct", "sds", "stochastic", "ngd_current", "sds_fresh"]
+
+
+@pytest.mark.parametrize("strategy", [*METHODS, "ngd_sharp strategy.patch=8"])
 def test_no_method_sees_the_truth(strategy, data, run, tmp_path):
     """Other target images, depths and masks: the same predictions, bit for bit."""
-    cfg = config(data, run, tmp_path, f"strategy={strategy}")
+    cfg = config(data, run, tmp_path, *f"strategy={strategy}".split())
     evaluation = dataset_run(cfg, torch.device("cpu"))
     (scene,) = evaluation.load(["scene0"])
     other = dataclasses.replace(scene, target_pixels=255 - scene.target_pixels, target_depth=None, target_mask=None)

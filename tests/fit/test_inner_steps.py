@@ -12,9 +12,12 @@ from nerfdiff.cameras import Cameras, Rays
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.fit.inner_steps import InnerSteps
+from nerfdiff.fit.objective import FitLoss, Objective, ray_entropy, total_variation
 from nerfdiff.fit.ray_batches import RayBatches
 from nerfdiff.fit.refined_field import RefinedField
+from nerfdiff.fit.weight_average import WeightAverage
 from nerfdiff.render.renderer import Renderer
+from nerfdiff.utils.errors import ConfigError
 
 RENDERER = Renderer(4, 3, 1.0, 4096)
 SIZE, RAYS, STEPS = 16, 32, 5
@@ -40,6 +43,8 @@ def inner_steps(
     rays: int = RAYS,
     record: bool = False,
     coarse: torch.Tensor | None = None,
+    objective: Objective | None = None,
+    average: WeightAverage | None = None,
 ) -> InnerSteps:
     device = field.planes.device
     batches = RayBatches(views(len(field)).to(device), field.near, field.far)
@@ -53,7 +58,8 @@ def inner_steps(
         capturable=device.type == "cuda",
     )
     generators = [torch.Generator(device).manual_seed(scene) for scene in range(len(field))]
-    return InnerSteps(field, RENDERER, batches, optimizer, rays, generators, record)
+    loss = FitLoss(objective, device)
+    return InnerSteps(field, RENDERER, batches, optimizer, rays, generators, record, loss, average)
 
 
 @pytest.mark.parametrize("remembered", [False, True])
@@ -92,6 +98,119 @@ def test_steps_are_those_of_a_plain_loop_over_each_scene_by_itself(remembered):
         for name, value in reference.decoder.named_parameters():
             fitted = dict(field.decoder.named_parameters())[name][scene]
             torch.testing.assert_close(fitted, value, atol=2e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("side", [1, 3, SIZE])
+def test_patches_are_the_cameras_rays_at_squares_of_pixels_of_the_chosen_views(side):
+    field, cameras = fields(2), views(2)
+    images = torch.rand(2, 2, 3, SIZE, SIZE)
+    batches = RayBatches(cameras, field.near, field.far)
+    batches.set_colours(images)
+    batches.set_weights(images[:, :, 0])
+    every = cameras.rays(field.near[:, None], field.far[:, None])
+    for chosen in (None, torch.tensor([[1], [0]])):
+        batches.set_views(chosen)
+        picked = batches.draw(
+            side, torch.empty(2, 9, dtype=torch.long), [torch.Generator().manual_seed(5 + s) for s in (0, 1)]
+        )
+        rays, colours = batches.at(picked)
+        weights = batches.weights_at(picked)
+        assert picked.shape == (2, 9 * side**2)
+        seen = set()
+        for scene in range(2):
+            for patch in range(9):
+                first = int(picked[scene, patch * side**2])
+                view, row, column = first // SIZE**2, first // SIZE % SIZE, first % SIZE
+                seen.add((scene, view))
+                assert row + side <= SIZE and column + side <= SIZE
+                square = (scene, view, slice(row, row + side), slice(column, column + side))
+                own = slice(patch * side**2, (patch + 1) * side**2)
+                for name in ("origins", "directions"):
+                    expected = getattr(every, name)[square].reshape(-1, 3)
+                    torch.testing.assert_close(getattr(rays, name)[scene, own], expected, atol=0, rtol=0)
+                assert rays.near[scene, own].eq(every.near[square].flatten()).all()
+                assert colours[scene, own].eq(images.movedim(2, -1)[square].reshape(-1, 3)).all()
+                assert weights[scene, own].eq(images[:, :, 0][square].flatten()).all()
+        assert seen == {(0, 1), (1, 0)} if chosen is not None else len(seen) == 4
+
+
+def test_patches_are_everywhere_that_they_fit():
+    batches = RayBatches(views(1), torch.tensor([0.8]), torch.tensor([1.8]))
+    side = SIZE - 1
+    picked = batches.draw(side, torch.empty(1, 200, dtype=torch.long), [torch.Generator().manual_seed(0)])
+    corners = set(picked[0, :: side**2].tolist())
+    assert corners == {view * SIZE**2 + row * SIZE + column for view in (0, 1) for row in (0, 1) for column in (0, 1)}
+
+
+@pytest.mark.parametrize(("side", "rays", "message"), [(SIZE + 1, 289, "images of 16 pixels"), (3, 32, "27 or 36")])
+def test_patches_that_cannot_be_are_refused(side, rays, message):
+    with pytest.raises(ConfigError, match=message):
+        inner_steps(fields(1), IMAGES, rays, objective=Objective(patch=side))
+
+
+def test_steps_on_patches_with_weights_and_regularisers_are_those_of_a_plain_loop():
+    """Written out in one place; each scene's own, with all that an objective has."""
+    side, objective = 8, Objective(patch=8, loss="l1", perceptual_weight=0.2, entropy_weight=0.1, tv_weight=0.3)
+    field, images = fields(2), torch.rand(2, 2, 3, SIZE, SIZE)
+    weights = torch.rand(2, 2, SIZE, SIZE)
+    references = [copy.deepcopy(field.alone(scene)) for scene in range(2)]
+    average = WeightAverage(field)
+    average.start()
+    inner = inner_steps(field, images, 2 * side**2, objective=objective, average=average)
+    inner.batches.set_weights(weights)
+    errors, patchwise = inner.run(3), FitLoss(objective)
+    assert inner.queries == 128 * 7 + 16 * 4
+    for scene, reference in enumerate(references):
+        draws = torch.Generator().manual_seed(scene)
+        corners = torch.empty(3, 2, dtype=torch.long).random_(2 * (SIZE - side + 1) ** 2, generator=draws)
+        jitter = torch.empty(3, 128, 7).uniform_(generator=draws)
+        optimizer = torch.optim.Adam(
+            [{"params": [reference.planes], "lr": 1e-2}, {"params": reference.decoder.parameters(), "lr": 1e-3}],
+            foreach=False,
+        )
+        rays = views(1)[0].rays(reference.near, reference.far)
+        parts = {
+            name: values.expand(*rays.directions.shape[:3], *values.shape[3:]) for name, values in vars(rays).items()
+        }
+        planes = []
+        for step in range(3):
+            view, row, column = torch.unravel_index(corners[step], (2, SIZE - side + 1, SIZE - side + 1))
+            squares = [
+                (int(v), slice(int(r), int(r) + side), slice(int(c), int(c) + side))
+                for v, r, c in zip(view, row, column, strict=True)
+            ]
+
+            def taken(values, squares=squares):
+                return torch.cat([values[square].flatten(0, 1) for square in squares])[None]
+
+            chosen = Rays(**{name: taken(values) for name, values in parts.items()})
+            colours, weighed = taken(images[scene].movedim(1, -1)), taken(weights[scene])
+            rgb = RENDERER.render(reference.field(), chosen, jitter[step][None]).rgb
+            loss, _ = patchwise(rgb, colours, weighed)
+            few = Rays(**{name: values[:, ::8] for name, values in vars(chosen).items()})
+            loss = loss + 0.3 * total_variation(reference.planes)
+            loss = loss + 0.1 * ray_entropy(reference.field(), few, jitter[step][None, ::8, :4]).mean()
+            assert errors[step, scene].item() == pytest.approx((rgb - colours).square().mean().item(), rel=1e-4)
+            optimizer.zero_grad()
+            loss.sum().backward()
+            optimizer.step()
+            planes.append(reference.planes.detach()[0].clone())
+        torch.testing.assert_close(field.planes[scene], planes[-1], atol=2e-5, rtol=1e-4)
+        mean = torch.stack(planes).mean(0)
+        torch.testing.assert_close(average.snapshot()["planes"][scene], mean, atol=2e-5, rtol=1e-4)
+
+
+def test_the_mean_is_of_the_steps_since_it_began():
+    field, found = fields(1), []
+    average = WeightAverage(field)
+    inner = inner_steps(field, IMAGES, average=average)
+    inner.run(2)
+    average.start()
+    for _ in range(3):
+        inner.run(1)
+        found.append(field.snapshot())
+    for name, value in average.snapshot().items():
+        torch.testing.assert_close(value, torch.stack([one[name] for one in found]).mean(0))
 
 
 def test_painting_changes_what_is_fitted_and_drawing_goes_on():

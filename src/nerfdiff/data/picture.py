@@ -19,7 +19,7 @@ from nerfdiff.data.batch import Sample, ViewBatch
 from nerfdiff.data.formats.images import decode_with_alpha
 from nerfdiff.data.readers.masks import read_mask
 from nerfdiff.data.scene import Scene
-from nerfdiff.utils.errors import ConfigError, DataError
+from nerfdiff.utils.errors import BackgroundError, ConfigError, DataError
 
 log = logging.getLogger(__name__)
 
@@ -90,18 +90,22 @@ class Picture:
             if not possible:
                 raise ConfigError(f"picture.{key}={getattr(self, key)}: expected {expected}")
 
-    def load(self, path: str | Path, image_size: Sequence[int]) -> ViewBatch:
+    def load(
+        self, path: str | Path, image_size: Sequence[int], where: Bool[np.ndarray, "rows columns"] | None = None
+    ) -> ViewBatch:
         """The picture as a batch of one scene, named after the file, whose only target is the source view itself.
 
         Args:
             image_size: (height, width) of the model's images.
+            where: the object is, in the picture's pixels; None: `mask` or the picture says so.
 
         Raises:
+            BackgroundError: it does not tell object from background.
             DataError: the picture or its mask cannot be read, they differ in size, the mask is empty or covers the
-                border, the picture shows no object, or it does not tell object from background.
+                border, or the picture shows no object.
         """
         path, (height, width) = Path(path), image_size
-        pixels, where = self._cut_out(path)
+        pixels, where = self._cut_out(path, where)
         framed = area_resample(pixels, self._window(where, height, width), (height, width))
         if self._near_white(framed).all():
             raise DataError(f"{path}: no object in it; framed at {height}x{width} it is white all over")
@@ -112,12 +116,16 @@ class Picture:
         scene = Scene(scene_id(path), (VIEW,), framed[None], cameras, float(self.near), float(self.far))
         return ViewBatch.collate([Sample(scene, source=0, targets=[0], draw=0)])
 
-    def _cut_out(self, path: Path) -> tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
+    def _cut_out(
+        self, path: Path, where: Bool[np.ndarray, "height width"] | None
+    ) -> tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
         """The picture with white around the object, and where the object is."""
         pixels, opaque = decode_with_alpha(path, upright=True)
         white = self._near_white(pixels)
         edges = False  # where something may show beside the object
-        if self.mask is not None:
+        if where is not None:
+            pass
+        elif self.mask is not None:
             where = self._masked(path, pixels.shape[:2])
             where = where if opaque is None else where & opaque
         elif opaque is not None and _of_border(~opaque) >= self.open_border:
@@ -161,10 +169,11 @@ class Picture:
     ) -> None:
         if (found := _of_border(white)) < self.white_border:
             clear = 0.0 if opaque is None else _of_border(~opaque)
-            raise DataError(
+            raise BackgroundError(
                 f"{path}: {1 - found:.0%} of its border is not white, and only {clear:.0%} is transparent, so object "
                 "and background cannot be told apart. Give an RGBA picture with a transparent background, or "
-                "picture.mask=<image of its size, white where the object is>, or a picture on white"
+                "picture.mask=<image of its size, white where the object is>, or a picture on white; "
+                "or let picture.py cut it out"
             )
 
     def _without_specks(self, path: Path, where: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:

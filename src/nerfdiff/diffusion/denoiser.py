@@ -1,10 +1,10 @@
 """The 3D-aware conditional diffusion model (paper, "3D-aware Conditional Diffusion Models")."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from nerfdiff.cameras import Cameras
@@ -66,6 +66,11 @@ class Condition:
     cameras: Cameras
     near: Float[Tensor, "batch"]
     context: Context
+
+    def __getitem__(self, views: slice | Int64[Tensor, "some"]) -> "Condition":
+        """Take some of one scene's views."""
+        own = {name: getattr(self, name)[views] for name in ("rendered", "source", "cameras", "near")}
+        return replace(self, **own)
 
 
 class Denoiser(nn.Module):

@@ -11,6 +11,7 @@ from torch import Tensor
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.diffusion.sampler import SamplerSettings, sample
+from nerfdiff.distill.autoguidance import Autoguidance
 from nerfdiff.distill.strategy import PredictedViews
 from nerfdiff.distill.virtual_views import Images, VirtualViews
 from nerfdiff.field.encoder import Encoding
@@ -45,12 +46,14 @@ class CDMSampling:
     Args:
         steps: diffusion steps.
         views_at_once: views denoised in one batch, which bounds memory.
+        autoguidance: by an earlier snapshot.
     """
 
     name: str
     steps: int
     sampling: SamplerSettings
     views_at_once: int
+    autoguidance: Autoguidance | None = None
 
     @torch.no_grad()
     def predict(
@@ -61,7 +64,8 @@ class CDMSampling:
         for scene in scenes:
             images = self.sample(model, model.encode(scene), scene.target_cameras, (seed, "cdm", *scene.scene_ids))[0]
             rendered = model.renderer.samples_per_ray * images[:, 0].numel()  # the CDM's condition
-            predicted.append(PredictedViews(images, denoiser_calls=self.steps * len(images), field_queries=rendered))
+            calls = self.steps * len(images) * (2 if self.autoguidance is not None and self.autoguidance.on else 1)
+            predicted.append(PredictedViews(images, denoiser_calls=calls, field_queries=rendered))
         return predicted
 
     @torch.no_grad()
@@ -74,4 +78,5 @@ class CDMSampling:
             seed: a view's noise depends on it and on the view's position, not on what is sampled beside it.
         """
         views = VirtualViews(model, encoding, cameras, self.views_at_once, seed)
+        views.autoguide(self.autoguidance)
         return sample_views(views, self.steps, self.sampling)[None]

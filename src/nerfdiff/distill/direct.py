@@ -1,6 +1,7 @@
 """Direct distillation: sample every view once by itself, and fit the field to the samples (paper, appendix)."""
 
 from nerfdiff.diffusion.sampler import SamplerSettings
+from nerfdiff.distill.autoguidance import Autoguidance
 from nerfdiff.distill.cdm import sample_views
 from nerfdiff.distill.virtual_views import Images, VirtualViews
 from nerfdiff.utils.config import from_keys
@@ -14,7 +15,7 @@ class FixedTeacher:
         steps: how many times they are asked for, to fit as long as the other methods do.
     """
 
-    t = weight = None
+    t = weight = view_weights = None
     follows_field = False
 
     def __init__(self, images: Images, steps: int):
@@ -33,7 +34,16 @@ class DirectTeacher(FixedTeacher):
         steps: see `FixedTeacher`.
         sampler_steps: diffusion steps.
         sampling: see `sample_views`.
+        autoguidance: by an earlier snapshot.
     """
 
-    def __init__(self, views: VirtualViews, steps: int, sampler_steps: int, sampling: SamplerSettings):
+    def __init__(
+        self,
+        views: VirtualViews,
+        steps: int,
+        sampler_steps: int,
+        sampling: SamplerSettings,
+        autoguidance: Autoguidance | None = None,
+    ):
+        views.autoguide(autoguidance)
         super().__init__(sample_views(views, sampler_steps, sampling), steps)

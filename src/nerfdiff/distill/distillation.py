@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from lightning import Callback, Trainer
@@ -15,6 +15,7 @@ from nerfdiff.distill.strategy import PredictedViews
 from nerfdiff.distill.teacher import MakeTeacher
 from nerfdiff.distill.virtual_views import VirtualViews
 from nerfdiff.field.triplane import Triplane
+from nerfdiff.fit.objective import Objective
 from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.fit.saved_field import SavedField
 from nerfdiff.fit.settings import FitSettings
@@ -25,7 +26,7 @@ from nerfdiff.utils.errors import ConfigError
 log = logging.getLogger(__name__)
 
 
-@from_keys(fit=FitSettings)
+@from_keys(fit=FitSettings, objective=Objective)
 @dataclass(frozen=True)
 class Distillation:
     """Encode once, fit the field to the teacher's images of the virtual views, render.
@@ -34,6 +35,7 @@ class Distillation:
         prior: Π, the virtual views' cameras.
         teacher: makes the teacher of a scene from its virtual views.
         views_at_once: views denoised in one batch, which bounds memory.
+        objective: what the field is fitted for.
     """
 
     name: str
@@ -41,6 +43,7 @@ class Distillation:
     teacher: MakeTeacher
     fit: FitSettings
     views_at_once: int
+    objective: Objective = field(default_factory=Objective)
 
     def predict(
         self, model: NerfDiff, scenes: Sequence[ViewBatch], seed: int, callbacks: Sequence[Callback] = ()
@@ -79,12 +82,12 @@ class Distillation:
         triplane = Triplane.join([encoding.triplane for encoding in encodings])
         # place the virtual views
         views = [
-            VirtualViews(model, encoding, self.prior(scene), self.views_at_once, own)
+            VirtualViews(model, encoding, self.prior(scene), self.views_at_once, own, self.fit.views_last)
             for encoding, scene, own in zip(encodings, scenes, seeds, strict=True)
         ]
         # fit the field to the teachers' images
         teachers = [self.teacher(v) for v in views]
-        module = NGDModule(RefinedField(triplane, model.decoder), views, teachers, self.fit, seeds)
+        module = NGDModule(RefinedField(triplane, model.decoder), views, teachers, self.fit, seeds, self.objective)
         device = scenes[0].source.device
         with torch.enable_grad(), _quiet("lightning.pytorch"):
             trainer = Trainer(

@@ -12,11 +12,13 @@ from nerfdiff.distill.teacher import Teacher
 from nerfdiff.distill.trace import Step
 from nerfdiff.distill.virtual_views import VirtualViews
 from nerfdiff.fit.inner_steps import InnerSteps
-from nerfdiff.fit.ray_batches import RayBatches
+from nerfdiff.fit.objective import FitLoss, Objective
+from nerfdiff.fit.ray_batches import RayBatches, with_views
 from nerfdiff.fit.refined_field import RefinedField, choose
 from nerfdiff.fit.settings import DECAYS, FitSettings
+from nerfdiff.fit.weight_average import WeightAverage
 from nerfdiff.metrics.image import psnr_of_mse
-from nerfdiff.render.renderer import Renderer
+from nerfdiff.render.renderer import RenderedViews, Renderer
 from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.randomness import generator
 from nerfdiff.utils.timing import timed
@@ -36,6 +38,7 @@ class NGDModule(LightningModule):
         teachers: of each scene's target images; `ngd`, `direct`, `sds` and `stochastic` differ in nothing else.
         fit: the inner steps' settings.
         seeds: of each scene's rays.
+        objective: what the fields are fitted for, the paper's where it is not given.
 
     Raises:
         ConfigError: scenes with different numbers of views.
@@ -48,11 +51,13 @@ class NGDModule(LightningModule):
         teachers: Sequence[Teacher],
         fit: FitSettings,
         seeds: Sequence[tuple[int | str, ...]],
+        objective: Objective | None = None,
     ):
         super().__init__()
         self.automatic_optimization = False
         self.field = field
         self.views, self.teachers, self.settings, self.seeds = views, teachers, fit, seeds
+        self.objective = objective or Objective()
         if len({len(v) for v in views}) > 1:
             raise ConfigError(
                 f"scenes with {sorted({len(v) for v in views})} virtual views cannot be distilled together: "
@@ -88,7 +93,7 @@ class NGDModule(LightningModule):
     def on_train_start(self) -> None:
         self._start = self.field.snapshot()
         self._good = self._start
-        self._rendered: SceneImages | None = None
+        self._rendered: tuple[SceneImages, Float[Tensor, "scenes views height width"]] | None = None
         self._finite = torch.ones(len(self.field), dtype=torch.bool, device=self.device)
         self._finite_on_host = torch.ones(len(self.field), dtype=torch.bool, pin_memory=self.device.type == "cuda")
         self._fitted = self.cameras
@@ -96,6 +101,7 @@ class NGDModule(LightningModule):
             both = zip(self.cameras, self.field.cameras, strict=True)
             self._fitted = Cameras.stack([Cameras.join([views, source[None]]) for views, source in both])
         self._batches = RayBatches(self._fitted, self.field.near, self.field.far)
+        self._average = WeightAverage(self.field) if self.settings.average > 0 else None
         self._inner = InnerSteps(
             self.field,
             self._renderer,
@@ -104,6 +110,8 @@ class NGDModule(LightningModule):
             self.settings.rays,
             [generator(self.device, *seed, "rays") for seed in self.seeds],
             self.settings.cuda_graphs,
+            FitLoss(self.objective, self.device),
+            self._average,
         )
 
     def on_train_batch_start(self, step: int, batch_idx: int) -> int | None:
@@ -112,9 +120,12 @@ class NGDModule(LightningModule):
         return None if any(self._alive) else -1
 
     def training_step(self, step: int, batch_idx: int) -> None:
+        self._choose_views(step)
         # render the field, for the teachers to guide by
+        follows = self.teachers[0].follows_field
         with timed("guide"):
-            rendered = self._render_guidance() if self.teachers[0].follows_field else None
+            seen, depth = self._render_guidance() if follows or self.objective.confidence.on else (None, None)
+            rendered = self._of_all_views(seen) if follows else None
         # ask the teachers for targets: the guided, denoised images
         made = [
             teacher.targets(step, None if rendered is None else rendered[scene])
@@ -126,10 +137,14 @@ class NGDModule(LightningModule):
         targets = rendered if stays else torch.stack(made)
         # fit the field to them
         self._set_rates(DECAYS[self.settings.lr_decay](step / self.steps))
-        losses = targets.new_zeros(0, len(targets)) if stays else self._fit(targets)
+        if stays:
+            losses = targets.new_zeros(0, len(targets))
+        else:
+            self._weigh(targets, depth)
+            losses = self._fit(targets)
         # record, and keep the last finite field
         first, last = (losses[0], losses[-1]) if len(losses) else (None, None)
-        distance = first if rendered is None else _mse(rendered, targets)
+        distance = first if rendered is None else _mse(self._chosen_of(rendered), self._chosen_of(targets))
         one = self.teachers[self._alive.index(True)]
         self._records.append((one.t, one.weight, first, last, distance))
         self._keep_finite(losses, targets)
@@ -137,11 +152,15 @@ class NGDModule(LightningModule):
     def on_train_end(self) -> None:
         """Restore each scene's last finite field, or, where the fit made it worse, the field it began as.
 
+        Where weights are averaged, the mean takes the place of a finite scene's last field first.
+
         It is worse if it explains the last targets worse than the first field by more than `target_tolerance` (a little
         is allowed: the targets may have details that a blurred field gives up), or, as the targets may have followed
         the field astray, the input view by more than `source_tolerance`. This holds for a last finite field too.
         """
         self.field.restore(self._good, ~self._finite)
+        if self._average is not None:
+            self.field.restore(self._average.snapshot(), self._finite)
         worse = torch.zeros_like(self._finite)
         if self.settings.inner_steps > 0:
             refined, after = self._distances(), self.field.snapshot()
@@ -154,11 +173,8 @@ class NGDModule(LightningModule):
             self.field.restore(after, ~worse)
         for scene, (finite, diverged) in enumerate(zip(self._finite.tolist(), worse.tolist(), strict=True)):
             self.statuses[scene] = "non-finite" if not finite else "diverged" if diverged else "ok"
-        del (
-            self._inner,
-            self._batches,
-            self._rendered,
-        )  # module and Trainer hold each other: free the largest tensors now
+        # module and Trainer hold each other: free the largest tensors now
+        del self._inner, self._batches, self._rendered
 
     def trace(self, scene: int) -> list[Step]:
         """Return one scene's record, step by step. Waits for the device."""
@@ -175,6 +191,53 @@ class NGDModule(LightningModule):
         """Return t of the last step and the mean PSNR of renderings against targets, in dB. Waits for the device."""
         t, *_, distance = self._records[-1]
         return t, None if distance is None else float(psnr_of_mse(distance.nanmean()))
+
+    def _choose_views(self, step: int) -> None:
+        """Choose the views of a step, for denoising and fitting alike, and begin to average where it is time."""
+        for views in self.views:
+            views.choose(step, self.steps)
+        chosen = [views.chosen for views in self.views]
+        self._chosen = None if chosen[0] is None else torch.stack(chosen)
+        if self._chosen is not None:
+            self._rendered = None  # of other views
+        fitted = self._chosen
+        if fitted is not None and self.settings.fit_source:  # it comes after the virtual views
+            source = torch.full_like(fitted[:, :1], self.cameras.shape[1])
+            fitted = torch.cat([fitted, source], 1)
+        self._chosen_to_fit = fitted
+        self._batches.set_views(fitted)
+        if self._average is not None and step >= min(self.steps - 1, self.steps * (1 - self.settings.average)):
+            self._average.start()
+
+    def _chosen_of(self, values, fitted: bool = False):
+        """Take the entries of the chosen views, from tensors or cameras of leading shape [scenes, views].
+
+        Args:
+            fitted: with the input view, where it is fitted.
+        """
+        chosen = self._chosen_to_fit if fitted else self._chosen
+        return values if chosen is None else values[torch.arange(len(chosen), device=chosen.device)[:, None], chosen]
+
+    def _of_all_views(self, chosen: Float[Tensor, "scenes chosen *rest"]) -> Float[Tensor, "scenes views *rest"]:
+        """Put what the chosen views have among zeros for the others."""
+        if self._chosen is None:
+            return chosen
+        return with_views(chosen.new_zeros(*self.cameras.shape, *chosen.shape[2:]), self._chosen, chosen)
+
+    def _weigh(self, targets: SceneImages, depth: Float[Tensor, "scenes chosen height width"] | None) -> None:
+        """Set how much the pixels of the chosen views weigh, if any differ; the input view's weigh 1."""
+        weights = None
+        if self.objective.confidence.on:
+            weights = self.objective.confidence.weights(self._chosen_of(targets), depth, self._chosen_of(self.cameras))
+            weights = self._of_all_views(weights)
+        if self.teachers[0].view_weights is not None:
+            of_views = torch.stack([teacher.view_weights for teacher in self.teachers])[..., None, None]
+            weights = (torch.ones_like(targets[:, :, 0]) if weights is None else weights) * of_views
+        if weights is None:
+            return
+        if self.settings.fit_source:
+            weights = torch.cat([weights, torch.ones_like(weights[:, :1])], 1)
+        self._batches.set_weights(weights)
 
     @timed("fit")
     def _fit(self, targets: SceneImages) -> Float[Tensor, "steps scenes"]:
@@ -208,13 +271,17 @@ class NGDModule(LightningModule):
         self._last_targets = torch.where(keep, targets, self._last_targets)
         self._good = choose(self._finite, self.field.snapshot(), self._good)
 
-    def _render_guidance(self) -> SceneImages:
-        """Render the virtual views, unless the field is the one that was rendered last. Where coarse weights are kept,
-        the input view is rendered too if fitted."""
+    def _render_guidance(self) -> tuple[SceneImages, Float[Tensor, "scenes views height width"]]:
+        """Render the chosen views, unless the field and they are those that were rendered last; return images and
+        depths. Where coarse weights are kept, the input view is rendered too if fitted."""
         if self._rendered is None:
             cameras = self._fitted if self.keeps_coarse else self.cameras
-            rendered = self._render(cameras, self.settings.guidance(self._renderer), self.keeps_coarse)
-            self._rendered = rendered[:, : self.cameras.shape[1]]
+            cameras = self._chosen_of(cameras, fitted=self.keeps_coarse)
+            rendering = self._render(cameras, self.settings.guidance(self._renderer), self.keeps_coarse)
+            if rendering.coarse is not None:
+                self._batches.set_coarse(rendering.coarse.repeat_interleave(self._split, -1) / self._split)
+            views = self.cameras.shape[1] if self._chosen is None else self._chosen.shape[1]
+            self._rendered = rendering.images[:, :views], rendering.depth[:, :views]
         return self._rendered
 
     @property
@@ -222,18 +289,17 @@ class NGDModule(LightningModule):
         return self.views[0].model.renderer
 
     @torch.no_grad()
-    def _render(self, cameras: Cameras, renderer: Renderer, keep_coarse: bool = False) -> SceneImages:
+    def _render(self, cameras: Cameras, renderer: Renderer, keep_coarse: bool = False) -> RenderedViews:
         rendering = self.field.render(renderer, cameras, keep_coarse)
-        if rendering.coarse is not None:
-            self._batches.set_coarse(rendering.coarse.repeat_interleave(self._split, -1) / self._split)
         for views in self.views:
             views.field_queries += renderer.samples_per_ray * rendering.opacity[0].numel()
-        return rendering.images
+        return rendering
 
     def _distances(self) -> tuple[Float[Tensor, "scenes"], Float[Tensor, "scenes"]]:
         """Return the mean squared errors of the last targets and of the input view."""
-        source = self._render(self.field.cameras[:, None], self._renderer)
-        return _mse(self._render(self.cameras, self._renderer), self._last_targets), _mse(source[:, 0], self._source)
+        source = self._render(self.field.cameras[:, None], self._renderer).images
+        views = self._render(self._chosen_of(self.cameras), self._renderer).images
+        return _mse(views, self._chosen_of(self._last_targets)), _mse(source[:, 0], self._source)
 
 
 def _mse(images: Float[Tensor, "scenes *rest"], others: Float[Tensor, "scenes *rest"]) -> Float[Tensor, "scenes"]:

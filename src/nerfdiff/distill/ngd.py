@@ -9,6 +9,7 @@ from torch import Tensor
 
 from nerfdiff.diffusion.sampler import SamplerSettings
 from nerfdiff.diffusion.schedule import add_noise, alpha_sigma
+from nerfdiff.distill.autoguidance import Autoguidance
 from nerfdiff.distill.teacher import uses_current_rendering
 from nerfdiff.distill.virtual_views import Images, VirtualViews
 from nerfdiff.utils.config import from_keys
@@ -34,6 +35,7 @@ class Guidance:
         gamma: γ >= 0; 0 is plain sampling.
         compare: which image I the rendering is compared with: this step's (`current`, the paper's equation) or the
             `last` step's (its Algorithm 1).
+        t_min: time below which there is no guidance, so that fine detail is the CDM's own (MVEdit, arXiv 2403.12032).
 
     Raises:
         ConfigError: a value is none of these.
@@ -42,6 +44,7 @@ class Guidance:
     schedule: str
     gamma: float
     compare: str
+    t_min: float = 0.0
 
     def __post_init__(self):
         if self.schedule not in SCHEDULES:
@@ -50,9 +53,14 @@ class Guidance:
             raise ConfigError(f"guidance.compare={self.compare!r}: choose {', '.join(COMPARISONS)}")
         if not self.gamma >= 0:
             raise ConfigError(f"guidance.gamma={self.gamma} must be at least 0")
+        if not 0 <= self.t_min <= 1:
+            raise ConfigError(f"guidance.t_min={self.t_min}: expected a time from 0, which guides always, to 1")
 
     def weight(self, t: Float[Tensor, ""]) -> Float[Tensor, ""]:
         """Return w in [0, 1] at time t; finite at both ends."""
+        return torch.where(t < self.t_min, 0.0, self._scheduled(t))
+
+    def _scheduled(self, t: Float[Tensor, ""]) -> Float[Tensor, ""]:
         if self.schedule == "snr":
             alpha, sigma = alpha_sigma(t)
             # γσ² / α² without dividing by zero: at t = 1 any γ > 0 reaches the clamp
@@ -98,12 +106,14 @@ class NGDTeacher:
         at_full_guidance: what is computed in steps whose guided images are the renderings (w = 1): `everything`; `fit`,
             the inner steps without the denoiser, whose images would not be used (the same result, where deep levels
             are computed at each call); or `nothing`: fitting a field to its own renderings only blurs it.
+        autoguidance: by an earlier snapshot.
 
     Raises:
         ConfigError: another `condition` or `at_full_guidance`, or a sampler, spacing, times or eta that cannot be.
     """
 
     follows_field = True
+    view_weights = None
 
     def __init__(
         self,
@@ -113,11 +123,13 @@ class NGDTeacher:
         guidance: Guidance,
         condition: str,
         at_full_guidance: str = "fit",
+        autoguidance: Autoguidance | None = None,
     ):
         if at_full_guidance not in AT_FULL_GUIDANCE:
             known = ", ".join(AT_FULL_GUIDANCE)
             raise ConfigError(f"teacher.at_full_guidance={at_full_guidance!r}: choose {known}")
         self.at_full_guidance = at_full_guidance
+        views.autoguide(autoguidance)
         self.views, self.steps, self.guidance = views, steps, guidance
         self.sampler, self._deep = sampling.begin(), views.deep_features(sampling.deep)
         self.on_current = uses_current_rendering(condition)

@@ -14,7 +14,7 @@ from torch import Tensor
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.poses import SPIRAL_VIEWS, srn_spiral
-from nerfdiff.trajectories import look_at, look_at_point
+from nerfdiff.trajectories import Upright, look_at, look_at_point
 from nerfdiff.utils.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
@@ -153,11 +153,9 @@ class Sphere:
 
     def __call__(self, scene: ViewBatch) -> Cameras:
         radius = float(scene.near[0] + scene.far[0]) / 2
-        tilt = math.radians(self.source_elevation)
-        # the input camera stands at the origin and looks along z, its y pointing down
-        up = torch.tensor([0.0, -math.cos(tilt), -math.sin(tilt)], dtype=torch.float64)
-        front = torch.tensor([0.0, math.sin(tilt), -math.cos(tilt)], dtype=torch.float64)
-        middle = torch.tensor([0.0, 0.0, radius], dtype=torch.float64)
+        stands = Upright.assumed(radius, self.source_elevation).to(torch.float64)
+        middle, up = stands.point, stands.up
+        front = torch.stack([torch.zeros_like(up[2]), -up[2], up[1]])
         index = torch.arange(self.views, dtype=torch.float64) + 0.5
         low, high = (math.sin(math.radians(e)) for e in self.elevation)
         height = low + (high - low) * index / self.views  # on a sphere the height is uniform

@@ -3,6 +3,9 @@
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
+from jaxtyping import Float
+from torch import Tensor
+
 from nerfdiff.distill.virtual_views import Images, VirtualViews
 from nerfdiff.utils.errors import ConfigError
 
@@ -23,12 +26,16 @@ class Teacher(Protocol):
     weight: float | None
     """Weight of guidance at the last step, where there is one."""
 
+    view_weights: Float[Tensor, "views"] | None
+    """How much each view's loss weighs at the last step; None weighs all the same."""
+
     def targets(self, step: int, rendered: Images | None) -> Images | None:
         """Return images in [0, 1] to fit the field to; None where it stays as it is, its renderings being the targets.
 
         Args:
             step: from 0 to `steps` - 1, each once, in order.
-            rendered: the field's images of all views now, in [0, 1]; None where the teacher does not follow the field.
+            rendered: the field's images of the chosen views now, in [0, 1], and zeros for the others
+                (`VirtualViews.chosen`); None where the teacher does not follow the field.
         """
 
 

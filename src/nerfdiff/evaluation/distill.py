@@ -49,7 +49,7 @@ def distill(cfg: DictConfig) -> ResultRow | None:
         cfg = with_stress(cfg, "distill")
         fabric = _launch(cfg)
         run = picture_run(cfg, fabric.device) if cfg.image else dataset_run(cfg, fabric.device)
-        strategy, scorer = run.stressed(_strategy(cfg)), None if cfg.image else instantiate(cfg.metrics)
+        strategy, scorer = run.stressed(build_strategy(cfg)), None if cfg.image else instantiate(cfg.metrics)
         _predict_together(fabric, run, strategy)
         if fabric.global_rank > 0:
             return None
@@ -77,7 +77,7 @@ def distill(cfg: DictConfig) -> ResultRow | None:
     return row
 
 
-def _strategy(cfg: DictConfig) -> Strategy:
+def build_strategy(cfg: DictConfig) -> Strategy:
     """Build `cfg.strategy`; for a picture with `cfg.picture_views` as Π, instead of a dataset's."""
     settings = plain(cfg.strategy)
     if cfg.image and "prior" in settings:

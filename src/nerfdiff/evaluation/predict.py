@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from nerfdiff.data.batch import ViewBatch
+from nerfdiff.distill.priors import all_cameras
 from nerfdiff.distill.strategy import PredictedViews, Strategy
 from nerfdiff.distill.trace import PLOT, TRACE, plot_trace, write_trace
 from nerfdiff.evaluation.progress import SceneProgress
@@ -23,7 +24,7 @@ from nerfdiff.metrics.image import psnr
 from nerfdiff.metrics.predictions import SCENE, PredictionWriter
 from nerfdiff.results.pictures import orbit_video
 from nerfdiff.stability.judge import OK
-from nerfdiff.trajectories import orbit
+from nerfdiff.trajectories import Upright, orbit
 from nerfdiff.utils.errors import ConfigError, TimeUp, some
 from nerfdiff.utils.memory import peak_memory
 from nerfdiff.utils.timing import PartClock, Stopwatch
@@ -157,7 +158,8 @@ def _write(
 def _leave(run: EvaluationRun, strategy: Strategy, scene: ViewBatch, views: PredictedViews, folder: Path) -> None:
     """Write the field, its trace and an orbit into the scene's folder; a field that was fitted in any case."""
     if views.field is not None and (views.trace or run.settings.per_scene):
-        save_field(folder / FIELD, views.field)
+        stands = Upright.seen_by(all_cameras(scene)).to("cpu")
+        save_field(folder / FIELD, replace(views.field, stands=stands))
     if not run.settings.per_scene:
         return
     if views.trace:

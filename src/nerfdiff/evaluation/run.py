@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
@@ -143,11 +144,15 @@ class EvaluationRun:
         return strategy if self.stress is None else self.stress.strategy(strategy, self.load, self.scene_ids)
 
     def autocast(self) -> AbstractContextManager:
-        """Compute products in halves where the precision asks for it."""
-        if (halves := PRECISIONS[self.precision]) is None:
-            return nullcontext()
-        # Without the cache: it would keep the first half copy of parameters that a strategy fits.
-        return torch.autocast(self.device.type, halves, cache_enabled=False)
+        return autocast(self.device, self.precision)
+
+
+def autocast(device: torch.device, precision: str) -> AbstractContextManager:
+    """Compute products in halves where the precision asks for it."""
+    if (halves := PRECISIONS[precision]) is None:
+        return nullcontext()
+    # Without the cache: it would keep the first half copy of parameters that a strategy fits.
+    return torch.autocast(device.type, halves, cache_enabled=False)
 
 
 def choose_device(name: str) -> torch.device:
@@ -228,12 +233,7 @@ def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
         raise ConfigError(f"{loaded.path} does not say what image size it is for: give picture_size=[height,width]")
     if (stress := stress_of(cfg)) is not None and stress.input_view is not None:
         raise ConfigError(f"stress={stress.axis} chooses another input view, and a picture has none")
-    picture = instantiate(cfg.picture)
-    scene = picture.load(cfg.image, tuple(size))
-    cameras = instantiate(cfg.picture_views)(scene)
-    blank = scene.source_pixels[:, None].expand(-1, cameras.shape[1], -1, -1, -1)
-    names = tuple(f"{view:03d}" for view in range(cameras.shape[1]))
-    scene = replace(scene, target_cameras=cameras, target_pixels=blank, target_views=(names,))
+    scene = picture_scene(cfg, size)
     facts = {
         "split_sha256": sha256_values(list(scene.scene_ids)),
         "files_sha256": [sha256_file(file) for file in (cfg.image, cfg.picture.mask) if file],
@@ -242,6 +242,23 @@ def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
         "image_size": list(size),
     }
     return _run(cfg, device, loaded, lambda names: [scene] * len(names), list(scene.scene_ids), facts, None, stress)
+
+
+def picture_scene(cfg: DictConfig, size: Sequence[int], where: np.ndarray | None = None) -> ViewBatch:
+    """The scene of the picture `cfg.image`, whose targets are the cameras of `cfg.picture_views`, not yet known.
+
+    Args:
+        size: (height, width) of the model's images.
+        where: see `Picture.load`.
+
+    Raises:
+        UserError: bad picture or config.
+    """
+    scene = instantiate(cfg.picture).load(cfg.image, tuple(size), where)
+    cameras = instantiate(cfg.picture_views)(scene)
+    blank = scene.source_pixels[:, None].expand(-1, cameras.shape[1], -1, -1, -1)
+    names = tuple(f"{view:03d}" for view in range(cameras.shape[1]))
+    return replace(scene, target_cameras=cameras, target_pixels=blank, target_views=(names,))
 
 
 def _run(

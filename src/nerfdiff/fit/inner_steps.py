@@ -4,14 +4,15 @@ import logging
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfdiff.fit.objective import FitLoss
 from nerfdiff.fit.ray_batches import RayBatches
 from nerfdiff.fit.refined_field import RefinedField
+from nerfdiff.fit.weight_average import WeightAverage
 from nerfdiff.render.renderer import Renderer
-from nerfdiff.utils.errors import OutOfMemory, size_text
+from nerfdiff.utils.errors import ConfigError, OutOfMemory, size_text
 from nerfdiff.utils.memory import free_memory
 
 log = logging.getLogger(__name__)
@@ -35,6 +36,11 @@ class InnerSteps:
         rays: B, per step and scene.
         generators: one per scene, so that a scene's rays do not depend on the other scenes.
         record: replay a CUDA graph, on a GPU.
+        loss: of the rays, the paper's where it is not given; where it has patches, rays are drawn in them.
+        average: of the field's parameters, which every step adds to.
+
+    Raises:
+        ConfigError: patches larger than the images, or rays that are no whole number of them.
     """
 
     recording = True
@@ -49,9 +55,18 @@ class InnerSteps:
         rays: int,
         generators: Sequence[torch.Generator],
         record: bool,
+        loss: FitLoss | None = None,
+        average: WeightAverage | None = None,
     ):
         self.field, self.renderer, self.batches, self.optimizer = field, renderer, batches, optimizer
         self.rays, self.generators = rays, generators
+        self.loss, self.average = loss or FitLoss(), average
+        self._side = self.loss.objective.patch
+        self._patches = self.loss.objective.patches_of(rays)
+        if self._side > batches.largest_patch:
+            raise ConfigError(
+                f"strategy.patch={self._side}: images of {batches.largest_patch} pixels have no patch of that size"
+            )
         self._record = record and InnerSteps.recording and field.planes.device.type == "cuda"
         self._graph: torch.cuda.CUDAGraph | None = None
         self._steps: int | None = None
@@ -59,7 +74,7 @@ class InnerSteps:
     @property
     def queries(self) -> int:
         """Number of points of one scene at which a step evaluates its field."""
-        return self.rays * self.renderer.samples_per_ray
+        return self.rays * self.renderer.samples_per_ray + self.loss.queries(self.rays, self.renderer)
 
     @property
     def recorded(self) -> bool:
@@ -67,7 +82,7 @@ class InnerSteps:
         return self._graph is not None
 
     def run(self, steps: int) -> Float[Tensor, "{steps} scenes"]:
-        """Take `steps` steps; return the mean squared error of each, before it."""
+        """Take `steps` steps; return the mean squared error of each, before it, whatever the loss."""
         self._draw(steps)
         taken = 0
         if self._record and self._graph is None and steps > WARM_UP:
@@ -79,18 +94,19 @@ class InnerSteps:
 
     def _draw(self, steps: int) -> None:
         """Draw rays and samples on them into the same memory every time, which a recorded step reads."""
-        scenes, per_scene = self.batches.shape
+        scenes = len(self.field)
         device = self.field.planes.device
         if steps != self._steps:
-            self._require_memory(steps * scenes * self.rays * (8 + 4 * self.renderer.samples_per_ray), device)
+            self._require_memory(steps * scenes * self.rays * (16 + 4 * self.renderer.samples_per_ray), device)
             self._steps, self._graph = steps, None
+            self._drawn = torch.empty(scenes, steps, self._patches, dtype=torch.long, device=device)
             self._picked = torch.empty(scenes, steps, self.rays, dtype=torch.long, device=device)
             self._jitter = torch.empty(scenes, steps, self.rays, self.renderer.samples_per_ray, device=device)
             self._losses = torch.empty(steps, scenes, device=device)
             self._number = torch.zeros(1, dtype=torch.long, device=device)
-        for scene, source in enumerate(self.generators):
-            self._picked[scene].random_(per_scene, generator=source)
-            self._jitter[scene].uniform_(generator=source)
+        self._picked.copy_(self.batches.draw(self._side, self._drawn, self.generators))
+        for jitter, source in zip(self._jitter, self.generators, strict=True):
+            jitter.uniform_(generator=source)
         self._number.zero_()
 
     def _require_memory(self, needed: int, device: torch.device) -> None:
@@ -106,12 +122,16 @@ class InnerSteps:
         """Take the step whose number is on the device."""
         picked, jitter = (drawn.index_select(1, self._number)[:, 0] for drawn in (self._picked, self._jitter))
         rays, colours = self.batches.at(picked)
-        rgb = self.renderer.render(self.field.field(), rays, jitter, self.batches.coarse_at(picked)).rgb
-        losses = F.mse_loss(rgb, colours, reduction="none").mean((1, 2))
+        field = self.field.field()
+        rgb = self.renderer.render(field, rays, jitter, self.batches.coarse_at(picked)).rgb
+        losses, errors = self.loss(rgb, colours, self.batches.weights_at(picked))
+        losses = self.loss.regularise(losses, field, self.renderer, rays, jitter)
         self.optimizer.zero_grad()
         losses.sum().backward()  # each scene's gradient is that of its own loss
         self.optimizer.step()
-        self._losses.index_copy_(0, self._number, losses.detach()[None])
+        if self.average is not None:
+            self.average.update()
+        self._losses.index_copy_(0, self._number, errors[None])
         self._number += 1
 
     def _warm_up(self) -> int:

@@ -15,6 +15,7 @@ from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.render.renderer import Renderer
+from nerfdiff.trajectories import Upright
 from nerfdiff.utils.errors import DataError
 from nerfdiff.utils.files import atomic
 
@@ -31,10 +32,12 @@ class SavedField:
     Args:
         field: on the CPU, of one scene.
         renderer: its samples per ray, background and chunk.
+        stands: how the scene stands, where its cameras told.
     """
 
     field: RefinedField
     renderer: Renderer
+    stands: Upright | None = None
 
 
 def save_field(path: str | Path, saved: SavedField) -> None:
@@ -52,6 +55,8 @@ def save_field(path: str | Path, saved: SavedField) -> None:
         "decoder": field.decoder.settings,
         "render": {name: value for name, value in asdict(saved.renderer).items() if name not in MACHINES},
     }
+    if saved.stands is not None:
+        header["stands"] = {"point": saved.stands.point.tolist(), "up": saved.stands.up.tolist()}
     state = {name: value.detach().cpu().contiguous() for name, value in field.state_dict().items()}
     header["sha256"] = _digest(state)
     with atomic(Path(path)) as temporary:
@@ -77,7 +82,9 @@ def load_field(path: str | Path) -> SavedField:
         bounds = (torch.tensor([header[name]]) for name in ("near", "far"))
         field = RefinedField(Triplane(state["planes"], cameras, *bounds), Decoder(**header["decoder"]))
         field.load_state_dict(state)
-        return SavedField(field, Renderer(**header["render"]))
+        stands = header.get("stands")
+        stands = stands and Upright(torch.tensor(stands["point"]), torch.tensor(stands["up"]))
+        return SavedField(field, Renderer(**header["render"]), stands)
     except DataError:
         raise
     except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:

@@ -36,9 +36,13 @@ class FitSettings:
         cuda_graphs: record an inner step once and replay it, on a GPU.
         guidance_uniform_samples, guidance_importance_samples: per ray, where the field is rendered for the teacher;
             None, or more than the model has: the model's.
+        average: share of the teacher's steps, up to the last, over whose inner steps planes and decoder are averaged;
+            the mean is kept. 0 keeps what the last step left.
+        views_last: number of virtual views that are left at the last step, see `VirtualViews.choose`; None keeps all.
 
     Raises:
-        ConfigError: another `lr_decay` or `coarse`, no rays, negative steps, or no uniform samples.
+        ConfigError: another `lr_decay` or `coarse`, no rays, negative steps, an `average` outside [0, 1], or no
+            view or uniform samples.
     """
 
     inner_steps: int
@@ -53,6 +57,8 @@ class FitSettings:
     cuda_graphs: bool
     guidance_uniform_samples: int | None = None
     guidance_importance_samples: int | None = None
+    average: float = 0.0
+    views_last: int | None = None
 
     def __post_init__(self):
         if self.rays < 1 or self.inner_steps < 0:
@@ -61,6 +67,10 @@ class FitSettings:
             raise ConfigError(f"strategy.lr_decay={self.lr_decay!r}: choose {', '.join(DECAYS)}")
         if self.coarse not in COARSE:
             raise ConfigError(f"strategy.coarse={self.coarse!r}: choose {', '.join(COARSE)}")
+        if not 0 <= self.average <= 1:
+            raise ConfigError(f"strategy.average={self.average}: expected a share of the steps, from 0 to 1")
+        if self.views_last is not None and self.views_last < 1:
+            raise ConfigError(f"strategy.views_last={self.views_last} must be at least 1; null keeps all views")
         for name, least in (("uniform", 1), ("importance", 0)):
             key = f"guidance_{name}_samples"
             if (count := getattr(self, key)) is not None and count < least:

@@ -3,32 +3,20 @@
 Neither class is an `nn.Module`: a metric held by a LightningModule stays out of its checkpoints and its EMA.
 """
 
-from importlib.resources import as_file, files
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import interpolate
 from torchvision.models import VGG16_Weights
 
+from nerfdiff.fit.perceptual import at_least, shift_tolerant
 from nerfdiff.metrics.weights import WeightsFile
 
 LPIPS_NET = "vgg16"
 LPIPS_VGG = WeightsFile(
     url=VGG16_Weights.IMAGENET1K_V1.url, sha256="397923af", column="lpips", key="metrics.lpips_weights"
 )
-
-
-def at_least(images: Float[Tensor, "n 3 h w"], size: int) -> Float[Tensor, "n 3 H W"]:
-    """Images whose shorter side is below `size` pixels, enlarged bilinearly until it is; others as they are.
-
-    VGG halves its input four times, and reflects it at the border in the shift-tolerant variant.
-    """
-    if (shorter := min(images.shape[-2:])) >= size:
-        return images
-    height, width = (round(side * size / shorter) for side in images.shape[-2:])
-    return interpolate(images, (height, width), mode="bilinear", align_corners=False)
 
 
 class LPIPS:
@@ -70,17 +58,7 @@ class STLPIPS:
     """
 
     def __init__(self, device: torch.device | str = "cpu", min_size: int = 32):
-        from stlpips_pytorch import stlpips  # imports IPython, which takes seconds
-
-        # On the meta device no time (or random state) goes into weights that are replaced at once.
-        with torch.device("meta"):
-            net = stlpips.LPIPS(net="vgg", variant="shift_tolerant", pretrained=False, verbose=False)
-        with as_file(files("stlpips_pytorch") / "weights" / "vST0.0" / "vgg_shift_tolerant.pth") as path:
-            weights = torch.load(path, map_location="cpu", weights_only=True)
-        # The file names every linear layer once (lin0); the module also knows it as lins.0, the same object.
-        weights |= {f"lins.{i}.model.1.weight": weights[f"lin{i}.model.1.weight"] for i in range(5)}
-        net.load_state_dict(weights, assign=True)
-        self.net = net.requires_grad_(False).eval().to(device)
+        self.net = shift_tolerant("vgg").to(device)
         self.device, self.min_size = torch.device(device), min_size
         self._features: list[Tensor] = []
         self.net.net.slice4.register_forward_hook(self._keep)

@@ -12,6 +12,10 @@ class DataError(UserError, ValueError):
     """A dataset file or folder is missing, damaged or not in the expected layout."""
 
 
+class BackgroundError(DataError):
+    """A picture does not tell its object from the background."""
+
+
 class ConfigError(UserError, ValueError):
     """A configuration key or value is not one the program knows."""
 

@@ -1,0 +1,252 @@
+"""NerfDiff from Python: a picture to a scene, and what can be made of it.
+
+    import nerfdiff
+    model = nerfdiff.load("demo")
+    scene = model.distil("car.png")
+    scene.orbit("car.mp4")
+    scene.save("car.glb")
+
+Nothing is written but what is asked for. The settings are those of `conf/picture.yaml`.
+"""
+
+import copy
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from PIL import Image
+
+from nerfdiff.checkpoint import LoadedModel, load_model
+from nerfdiff.cli import load_config
+from nerfdiff.data.batch import ViewBatch
+from nerfdiff.data.cutout import Mask
+from nerfdiff.distill.priors import all_cameras
+from nerfdiff.evaluation.distill import build_strategy
+from nerfdiff.evaluation.progress import SceneProgress
+from nerfdiff.evaluation.run import autocast, choose_device, picture_scene
+from nerfdiff.exports.export import FORMATS, FieldExport
+from nerfdiff.exports.views import render_rgba, to_image
+from nerfdiff.fit.saved_field import SavedField, load_field, save_field
+from nerfdiff.trajectories import Upright
+from nerfdiff.utils.config import auto_precision, plain
+from nerfdiff.utils.errors import BackgroundError, ConfigError
+
+log = logging.getLogger(__name__)
+
+
+def load(ckpt: str | Path = "demo", device: str = "auto", weights: str = "ema") -> "Model":
+    """Read a trained model.
+
+    Args:
+        ckpt: a shipped model's name (`demo`: cars, `demo_chairs`), a run's folder, an exported model's, or a `.ckpt`.
+        device: auto, cpu, cuda, cuda:1, …
+        weights: `ema` or `raw`.
+
+    Raises:
+        CheckpointError, ConfigError: there is no such model, it cannot be read, or the device cannot be used.
+    """
+    place = choose_device(device)
+    loaded = load_model(ckpt, weights)
+    loaded.model.to(place).requires_grad_(False)
+    return Model(loaded, place)
+
+
+def load_scene(path: str | Path, device: str = "auto") -> "Scene":
+    """Read a scene that `Scene.save` or `distill.py` wrote (`field.safetensors`).
+
+    Raises:
+        DataError: it is none.
+    """
+    saved = load_field(path)
+    return Scene(replace(saved, field=saved.field.to(choose_device(device))))
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained model on a device."""
+
+    loaded: LoadedModel
+    device: torch.device
+
+    def distil(
+        self,
+        picture: str | Path,
+        *,
+        strategy: str = "ngd_current",
+        budget: str = "minutes",
+        elevation: float | None = None,
+        mask: str | Path | None = None,
+        seed: int = 0,
+        settings: Sequence[str] = (),
+    ) -> "Scene":
+        """Make a scene of one picture of an object, in about half a minute on a CPU core with `ckpt=demo`.
+
+        Args:
+            picture: with a transparent background, or on white, or with a mask; else the object is cut out, which a
+                log line says (`Scene.mask`).
+            strategy: `ngd_current`, `ngd`, `direct`, `sds`, `stochastic` or `none`.
+            budget: how much it may compute: `minutes` or `paper`.
+            elevation: degrees from which the picture looks down at the object; None: 20, which a log line says.
+            mask: file of the picture's size, white where the object is.
+            seed: of all noise.
+            settings: more of `conf/picture.yaml`, as on the command line: `["budget.steps=32"]`.
+
+        Raises:
+            DataError: the picture cannot be read, or no object stands out in it.
+            ConfigError: settings that cannot be, or a strategy that leaves no scene.
+        """
+        words = [f"ckpt={self.loaded.path}", f"strategy={strategy}", f"budget={budget}", f"seed={seed}"]
+        words += [] if elevation is None else [f"elevation={float(elevation)}"]
+        words += [] if mask is None else [f"mask={mask}"]
+        return self.distil_batch(*self.prepare(load_config("picture", [*words, *settings]), picture))
+
+    def prepare(self, cfg: DictConfig, picture: str | Path) -> tuple[DictConfig, ViewBatch, Mask | None]:
+        """Frame a picture as this model's training images were, and cut it out where that is needed.
+
+        Args:
+            cfg: composed of `conf/picture.yaml`.
+
+        Returns:
+            the config of this picture, the picture as a batch, and the mask where one had to be found.
+
+        Raises:
+            DataError: see `distil`.
+        """
+        cfg, size = _of_picture(cfg, picture, self.loaded), self.loaded.image_size or plain(cfg.picture_size)
+        if size is None:
+            raise ConfigError(f"{self.loaded.path} does not say its image size: give picture_size=[height,width]")
+        mask = None
+        try:
+            scene = picture_scene(cfg, size)
+        except BackgroundError:
+            mask = instantiate(cfg.cutout).find(picture)
+            doubts = "".join(f"; {doubt}" for doubt in mask.doubts)
+            log.warning(
+                "%s: its background is neither transparent nor white; the object was cut out %s%s. Look at the mask; "
+                "mask=<image of its size, white where the object is> gives a better one",
+                picture,
+                mask.how,
+                doubts,
+            )
+            scene = picture_scene(cfg, size, mask.where)
+        return cfg, scene.to(self.device), mask
+
+    def distil_batch(self, cfg: DictConfig, batch: ViewBatch, mask: Mask | None = None) -> "Scene":
+        """Make a scene of what `prepare` returned."""
+        strategy, precision = build_strategy(cfg), auto_precision(self.device.type)
+        with SceneProgress(strategy.name, 1, cfg.progress_every) as progress, autocast(self.device, precision):
+            (views,) = strategy.predict(self.loaded.model, [batch], cfg.seed, progress.callbacks(1))
+        if views.field is None:
+            raise ConfigError(f"strategy={strategy.name} leaves no scene: choose one that does, as ngd_current")
+        if views.status != "ok":
+            log.warning("the fit was %s: this is the last field before that", views.status)
+        stands = Upright.seen_by(all_cameras(batch)).to("cpu")
+        picture = Image.fromarray(batch.source_pixels[0].permute(1, 2, 0).cpu().numpy())
+        return Scene(replace(views.field, stands=stands), picture, mask, views.status)
+
+
+def _of_picture(cfg: DictConfig, picture: str | Path, loaded: LoadedModel) -> DictConfig:
+    """The config for one picture: its own framing where nobody set another, its elevation and mask."""
+    cfg = copy.deepcopy(cfg)
+    cfg.image = str(picture)
+    if cfg.mask is not None:
+        cfg.picture.mask = cfg.mask
+    if cfg.elevation is not None:
+        cfg.picture_views.source_elevation = cfg.elevation
+    else:
+        log.info(
+            "%s is taken to look down from %g degrees at its object; say elevation=… if that is wrong",
+            picture,
+            cfg.picture_views.source_elevation,
+        )
+    dataset = loaded.trained_on[-1]["dataset"] if loaded.trained_on else None
+    if dataset not in cfg.framings:
+        log.warning(
+            "%s was trained on %s, whose framing is not known: the picture is framed as SRN's cars (picture.near, "
+            "picture.far, picture.object_share and picture.fov say otherwise)",
+            loaded.path,
+            dataset or "unknown data",
+        )
+        return cfg
+    for key, value in cfg.framings[dataset].items():
+        if cfg.picture[key] == cfg.framings.srn_cars[key]:
+            cfg.picture[key] = value
+    return cfg
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene that can be seen from any side.
+
+    Args:
+        saved: the field and its renderer.
+        picture: as the model saw it; None where the scene was read from a file.
+        mask: where the object was found, if that had to be.
+        status: `ok`, or why the field is not the one that the fit ended with.
+    """
+
+    saved: SavedField
+    picture: Image.Image | None = None
+    mask: Mask | None = None
+    status: str = "ok"
+
+    def render(self, azimuth: float = 0.0, elevation: float | None = None, height: int | None = None) -> Image.Image:
+        """A picture of the scene with a transparent background.
+
+        Args:
+            azimuth: degrees around the scene, anticlockwise seen from above; 0 is the input camera's.
+            elevation: degrees above the horizon; None: the input camera's.
+            height: in pixels; None: the input picture's.
+        """
+        where = None if elevation is None else torch.tensor([float(elevation)])
+        export = self._export()
+        camera = export.stands.around(export.source, torch.tensor([float(azimuth)]), where)
+        camera = camera.to(self.saved.field.K.device)
+        return to_image(render_rgba(self.saved, camera, height or camera.height)[0])
+
+    def orbit(self, path: str | Path, frames: int = 48, fps: int = 24, height: int = 256) -> Path:
+        """Write a video of a full turn, as `.mp4` or `.gif`.
+
+        Raises:
+            ConfigError: another ending.
+        """
+        if Path(path).suffix not in (".mp4", ".gif"):
+            raise ConfigError(f"{path}: a video is called .mp4 or .gif")
+        return self._write(path, self._export(f"path.frames={frames}", f"fps={fps}", f"height={height}"))
+
+    def save(self, path: str | Path, *settings: str) -> Path:
+        """Write the scene: `.safetensors` for `load_scene` and the commands, or a format of `docs/exports.md`.
+
+        Args:
+            settings: of `conf/exports`, as on the command line: `"mesh.resolution=192"`.
+
+        Raises:
+            ConfigError: an ending that no format has, or a package that is not installed.
+            DataError: the file cannot be written, or the scene is empty.
+        """
+        if Path(path).suffix == ".safetensors":
+            save_field(path, self.saved)
+            return Path(path)
+        return self._write(path, self._export(*settings) if settings else self._default)
+
+    @cached_property
+    def _default(self) -> FieldExport:
+        return self._export()
+
+    def _export(self, *settings: str) -> FieldExport:
+        return FieldExport.of(self.saved, load_config("export", [f"device={self.saved.field.K.device}", *settings]))
+
+    @staticmethod
+    def _write(path: str | Path, export: FieldExport) -> Path:
+        path = Path(path)
+        kind = path.suffix.removeprefix(".")
+        if kind not in FORMATS or kind == "png":
+            names = ", ".join(f".{name}" for name in ("safetensors", *FORMATS) if name != "png")
+            raise ConfigError(f"{path}: no format is called so; expected one of {names} (a picture: scene.render)")
+        (written,) = export.write(path.parent, path.stem, [kind])
+        return written

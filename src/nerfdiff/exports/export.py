@@ -1,0 +1,153 @@
+"""Fields to files of other programs, by the settings of `conf/exports`."""
+
+import logging
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import imageio.v2 as imageio
+from hydra.utils import instantiate
+from jaxtyping import Float
+from omegaconf import DictConfig
+from torch import Tensor
+
+from nerfdiff.evaluation.run import SAMPLES, choose_device
+from nerfdiff.exports.models import write_mesh, write_points
+from nerfdiff.exports.surface import Surface, SurfaceSettings
+from nerfdiff.exports.viewer import write_viewer
+from nerfdiff.exports.views import CameraPath, over, render_rgba, to_image
+from nerfdiff.fit.saved_field import FIELD, SavedField, load_field
+from nerfdiff.metrics.image import quantise
+from nerfdiff.results.pictures import orbit_video
+from nerfdiff.trajectories import Upright
+from nerfdiff.utils.config import plain
+from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.files import atomic
+
+FORMATS = ("glb", "obj", "ply", "html", "mp4", "gif", "png")
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class FieldExport:
+    """What can be made of one field; what several files need is computed once.
+
+    Args:
+        stands: how its scene stands.
+        height: of pictures, in pixels.
+        views: pictures with transparency, of all along the path.
+        background: grey level of videos.
+        points: of the point cloud.
+        viewer: arguments of `write_viewer`.
+    """
+
+    saved: SavedField
+    stands: Upright
+    path: CameraPath
+    mesh: SurfaceSettings
+    fps: int
+    height: int
+    views: int
+    background: float
+    points: int
+    viewer: Mapping[str, int]
+
+    @staticmethod
+    def of(saved: SavedField, cfg: DictConfig) -> "FieldExport":
+        """Take the settings of a composed config of `conf/exports`."""
+        samples = {name: cfg[name] for name in SAMPLES if cfg[name] is not None}
+        device = choose_device(cfg.device)
+        saved = replace(saved, field=saved.field.to(device), renderer=replace(saved.renderer, **samples))
+        middle = float(saved.field.near[0] + saved.field.far[0]) / 2
+        stands = saved.stands or Upright.assumed(middle, cfg.source_elevation)
+        numbers = {name: cfg[name] for name in ("fps", "height", "views", "background", "points")}
+        return FieldExport(
+            saved, stands, instantiate(cfg.path), instantiate(cfg.mesh), viewer=plain(cfg.viewer), **numbers
+        )
+
+    @cached_property
+    def source(self):
+        """The input camera [1]."""
+        return self.saved.field.cameras.to("cpu")
+
+    @cached_property
+    def surface(self) -> Surface:
+        return self.mesh.surface(self.saved, self.stands)
+
+    @cached_property
+    def frames(self) -> Float[Tensor, "frames 4 height _width"]:
+        """Pictures along the path, with transparency."""
+        cameras = self.path.cameras(self.source, self.stands).to(self.saved.field.K.device)
+        return render_rgba(self.saved, cameras, self.height)
+
+    def write(self, folder: Path, name: str, formats: Collection[str]) -> list[Path]:
+        """Write `<folder>/<name>.<format>` for each format; of png a folder `<name>_views`.
+
+        Raises:
+            ConfigError: an unknown format, or one that needs a package that is not installed.
+            DataError: the field is empty, or a file cannot be written.
+        """
+        check_formats(formats)
+        return [getattr(self, f"_{kind}")(folder / f"{name}.{kind}") for kind in dict.fromkeys(formats)]
+
+    def _glb(self, path: Path) -> Path:
+        return write_mesh(path, self.surface, self.source, self.stands)
+
+    _obj = _glb
+
+    def _ply(self, path: Path) -> Path:
+        return write_points(path, self.surface, self.source, self.stands, self.points)
+
+    def _html(self, path: Path) -> Path:
+        return write_viewer(path, self.saved, self.stands, path.stem, **self.viewer)
+
+    def _mp4(self, path: Path) -> Path:
+        return orbit_video(path, over(self.frames, self.background), self.fps)
+
+    def _gif(self, path: Path) -> Path:
+        frames = quantise(over(self.frames, self.background)).permute(0, 2, 3, 1).numpy()
+        with atomic(path) as temporary:
+            imageio.mimwrite(temporary, list(frames), duration=1000 / self.fps, loop=0)
+        return path
+
+    def _png(self, path: Path) -> Path:
+        folder = path.with_name(f"{path.stem}_views")
+        count = min(self.views, len(self.frames))
+        for number in range(count):
+            with atomic(folder / f"{number:02d}.png") as temporary:
+                to_image(self.frames[number * len(self.frames) // count]).save(temporary)
+        return folder
+
+
+def check_formats(formats: Collection[str]) -> None:
+    """Raise ConfigError where a format is not one of `FORMATS`."""
+    if unknown := sorted(set(formats) - set(FORMATS)) or not formats:
+        raise ConfigError(f"format={unknown if formats else '[]'}: expected some of {', '.join(FORMATS)}")
+
+
+def export_fields(cfg: DictConfig, fields: Sequence[str]) -> list[Path]:
+    """Write the files `cfg.format` of fields, beside them or into `cfg.out`; return what was written.
+
+    Raises:
+        UserError: something that is no field, settings that cannot be, or a field that is empty.
+    """
+    check_formats(cfg.format)
+    written = []
+    for path in map(Path, fields):
+        export = FieldExport.of(load_field(path), cfg)
+        if export.saved.stands is None:
+            log.warning(
+                "%s does not say how its scene stands: the camera is taken to look down from %g degrees "
+                "(source_elevation)",
+                path,
+                cfg.source_elevation,
+            )
+        written += export.write(Path(cfg.out or path.parent), field_name(path), cfg.format)
+    return written
+
+
+def field_name(path: Path) -> str:
+    """What a field's files are called: as the file, or as its folder where it is called like all fields."""
+    return path.absolute().parent.name if path.name == FIELD else path.stem

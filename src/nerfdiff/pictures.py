@@ -1,0 +1,125 @@
+"""Pictures to scenes, each in a folder of its own, with what a person opens next."""
+
+import json
+import logging
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig
+
+from nerfdiff.api import Model, Scene, load, load_scene
+from nerfdiff.cli import command_words
+from nerfdiff.data.cutout import Mask, write_mask
+from nerfdiff.data.picture import scene_id
+from nerfdiff.exports.export import FieldExport, check_formats
+from nerfdiff.exports.views import over, render_rgba
+from nerfdiff.fit.saved_field import FIELD
+from nerfdiff.results.pictures import contact_sheet
+from nerfdiff.utils.config import plain
+from nerfdiff.utils.errors import ConfigError, DataError, UserError
+from nerfdiff.utils.files import write_text
+from nerfdiff.utils.hashes import sha256_file, sha256_values
+
+SCENE = "scene.json"
+AROUND = 8
+"""Views of the contact sheet."""
+
+log = logging.getLogger(__name__)
+
+
+def pictures(cfg: DictConfig) -> list[Path]:
+    """Make a folder of every picture `cfg.images`; return the folders.
+
+    A scene that is there, made by the same settings of the same picture, is kept. A picture that fails leaves the
+    others alone.
+
+    Raises:
+        UserError: settings that cannot be; after all pictures, that some failed.
+    """
+    check_formats(cfg.format)
+    if not cfg.images:
+        raise ConfigError(f"name a picture: {' '.join(command_words('picture'))} car.jpg")
+    if cfg.mask is not None and len(cfg.images) > 1:
+        raise ConfigError(f"mask={cfg.mask} is of one picture, and there are {len(cfg.images)}: give one at a time")
+    if cfg.threads is not None:
+        torch.set_num_threads(cfg.threads)
+    model = load(cfg.ckpt, cfg.device, cfg.weights)
+    log.info("ckpt=%s", model.loaded.describe())
+    made, failed = [], []
+    for image, folder in zip(cfg.images, folders(cfg.images, Path(cfg.out)), strict=True):
+        try:
+            _make(cfg, model, Path(image), folder)
+            made.append(folder)
+        except UserError as error:
+            failed.append(str(error))
+            log.error("%s", error)
+    if failed:
+        some = f"{len(failed)} of {len(cfg.images)} pictures failed, see above" if len(cfg.images) > 1 else failed[0]
+        raise DataError(some)
+    return made
+
+
+def folders(images: Sequence[str], out: Path) -> list[Path]:
+    """A folder for each picture, called after its file; of files with one name the later ones have a number."""
+    found: list[Path] = []
+    for image in images:
+        name = number = scene_id(Path(image))
+        count = 1
+        while out / number in found:
+            count += 1
+            number = f"{name}_{count}"
+        found.append(out / number)
+    return found
+
+
+def _make(cfg: DictConfig, model: Model, image: Path, folder: Path) -> None:
+    cfg, batch, mask = model.prepare(cfg, image)
+    if mask is not None:
+        write_mask(mask, image, folder / "mask.png", folder / "cutout.png")
+        log.info("%s: the mask is %s, shown in %s", image, folder / "mask.png", folder / "cutout.png")
+    identity = _identity(cfg, model, image, mask)
+    scene = _kept(folder, identity, model)
+    if scene is None:
+        scene = model.distil_batch(cfg, batch, mask)
+        scene.save(folder / FIELD)
+        write_text(
+            folder / SCENE, json.dumps({"picture": str(image), "identity": identity, "status": scene.status}) + "\n"
+        )
+    else:
+        log.info("%s: the scene is there already, in %s", image, folder / FIELD)
+    written = [_views(scene, batch.source[0].cpu(), folder / "views.png")]
+    export = FieldExport.of(scene.saved, cfg)
+    for kind in cfg.format:
+        name = {"mp4": "orbit", "gif": "orbit", "html": "viewer"}.get(kind, folder.name)
+        written += export.write(folder, name, [kind])
+    print(*written, sep="\n")
+    more = " ".join([*command_words("export"), f"field={folder / FIELD}", "format=gif,png"])
+    print(f"next: look at {written[0]}; for other files: {more}")
+
+
+def _identity(cfg: DictConfig, model: Model, image: Path, mask: Mask | None) -> str:
+    """A digest of all that a scene depends on."""
+    files = [sha256_file(file) for file in (image, model.loaded.path, cfg.picture.mask) if file is not None]
+    found = None if mask is None else mask.where.tobytes().hex()
+    settings = [plain(cfg[key]) for key in ("strategy", "picture", "picture_views")]
+    return sha256_values([files, found, settings, cfg.seed, str(model.device)])
+
+
+def _kept(folder: Path, identity: str, model: Model) -> Scene | None:
+    """The scene that is there, if it is the one that would be made."""
+    with suppress(OSError, ValueError, UserError):
+        if json.loads((folder / SCENE).read_text())["identity"] == identity:
+            return load_scene(folder / FIELD, str(model.device))
+    return None
+
+
+def _views(scene: Scene, source: torch.Tensor, path: Path) -> Path:
+    """The picture, and the scene from all around, in a row."""
+    field, stands = scene.saved.field, scene.saved.stands
+    azimuth = torch.arange(AROUND) * (360 / AROUND)
+    cameras = stands.around(field.cameras.to("cpu"), azimuth, None).to(field.K.device)
+    shown = over(render_rgba(scene.saved, cameras, cameras.height), 1.0)
+    columns = {f"{angle:.0f}°": view[None] for angle, view in zip(azimuth.tolist(), shown, strict=True)}
+    return contact_sheet(path, {"picture": source[None]} | columns)

@@ -1,0 +1,112 @@
+"""Objects of stand-ins for photographs are found; where that is doubtful or impossible, it is said."""
+
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hydra.utils import instantiate
+from PIL import Image
+
+from nerfdiff.cli import load_config
+from nerfdiff.data.cutout import CutOut, write_mask
+from nerfdiff.inputs import ASSETS
+from nerfdiff.utils.errors import ConfigError, DataError
+from photographs import noise, photograph
+
+
+@pytest.fixture(autouse=True)
+def no_network(tmp_path, monkeypatch):
+    monkeypatch.setenv("U2NET_HOME", str(tmp_path / "none"))
+
+
+def cut_out(**changes) -> CutOut:
+    return instantiate(load_config("picture", []).cutout, **changes)
+
+
+def wagon() -> tuple[np.ndarray, np.ndarray]:
+    """The shipped picture, and where it is not transparent or white."""
+    image = np.asarray(Image.open(ASSETS / "pictures" / "wagon.png").convert("RGBA"))
+    where = (image[..., 3] > 127) & (image[..., :3] < 242).any(-1)
+    return image[..., :3], where
+
+
+def iou(a, b) -> float:
+    return (a & b).sum() / (a | b).sum()
+
+
+@pytest.mark.parametrize(
+    ("size", "centre", "share", "seed"),
+    [
+        ((300, 400), (0.5, 0.5), 0.75, 0),
+        ((300, 400), (0.4, 0.55), 0.7, 7),
+        ((3000, 4000), (0.6, 0.5), 0.6, 0),  # 12 megapixels
+    ],
+)
+def test_the_object_of_a_photograph_is_found(tmp_path, size, centre, share, seed):
+    truth = photograph(*wagon(), tmp_path / "car.jpg", size, centre, share, seed)
+    found = cut_out().find(tmp_path / "car.jpg")
+    assert found.where.shape == size and iou(found.where, truth) > 0.85
+    assert "without a network" in found.how and found.doubts == ()
+
+
+def test_a_photograph_held_upright_is_cut_out_upright(tmp_path):
+    truth = photograph(*wagon(), tmp_path / "car.jpg", (300, 400), (0.4, 0.5), 0.7, 0)
+    image = Image.open(tmp_path / "car.jpg")
+    image.getexif()[0x0112] = 6  # turned by a quarter
+    image.save(tmp_path / "turned.jpg", exif=image.getexif(), quality=95)
+    assert iou(cut_out().find(tmp_path / "turned.jpg").where, np.rot90(truth, -1)) > 0.85
+
+
+def test_a_photograph_of_nothing_is_refused_and_says_what_to_give(tmp_path):
+    for name, pixels in (("grey", np.full((60, 80, 3), 0.5)), ("noise", noise((60, 80), 0, 0.0))):
+        Image.fromarray((pixels * 255).astype(np.uint8)).save(tmp_path / f"{name}.png")
+    with pytest.raises(DataError, match=r"grey\.png: no object stands out.*Give a mask"):
+        cut_out().find(tmp_path / "grey.png")
+
+
+def test_a_cropped_object_is_doubted(tmp_path):
+    pixels = (noise((120, 160), 1) * 255).astype(np.uint8)
+    pixels[30:90, 80:] = (200, 20, 30)
+    Image.fromarray(pixels).save(tmp_path / "half.png")
+    found = cut_out().find(tmp_path / "half.png")
+    assert any("touches" in doubt for doubt in found.doubts)
+
+
+def test_the_mask_is_shown_and_can_be_given_back(tmp_path):
+    truth = photograph(*wagon(), tmp_path / "car.jpg", (300, 400), (0.5, 0.5), 0.75, 0)
+    found = cut_out().find(tmp_path / "car.jpg")
+    write_mask(found, tmp_path / "car.jpg", tmp_path / "mask.png", tmp_path / "shown.png")
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "mask.png")), found.where)
+    shown = np.asarray(Image.open(tmp_path / "shown.png"))
+    photo = np.asarray(Image.open(tmp_path / "car.jpg"))
+    inside = found.where & truth
+    assert np.array_equal(shown[inside], photo[inside]) and (shown[~found.where] >= 128).any(-1).all()
+
+
+def test_a_networks_weights_are_taken_where_they_are_and_never_fetched(tmp_path, monkeypatch):
+    photograph(*wagon(), tmp_path / "car.jpg", (60, 80), (0.5, 0.5), 0.75, 0)
+    square = np.zeros((60, 80), np.uint8)
+    square[20:40, 30:50] = 255
+    asked = []
+    rembg = SimpleNamespace(
+        new_session=lambda name, **keys: asked.append((name, keys)),
+        remove=lambda image, session, only_mask: Image.fromarray(square),
+    )
+    monkeypatch.setitem(sys.modules, "rembg", rembg)
+    assert "without a network" in cut_out().find(tmp_path / "car.jpg").how and asked == []
+    home = tmp_path / "weights"
+    home.mkdir()
+    (home / "u2net.onnx").touch()
+    monkeypatch.setenv("U2NET_HOME", str(home))
+    found = cut_out().find(tmp_path / "car.jpg")
+    assert found.where.sum() == 400 and found.how == "by rembg's u2net" and asked == [("u2net", {})]
+    own = str(home / "own.onnx")
+    with pytest.raises(ConfigError, match=r"own\.onnx: no such file"):
+        cut_out(weights=own).find(tmp_path / "car.jpg")
+    (home / "own.onnx").touch()
+    cut_out(weights=own).find(tmp_path / "car.jpg")
+    assert asked[-1] == ("u2net_custom", {"model_path": own})
+    monkeypatch.setitem(sys.modules, "rembg", None)
+    with pytest.raises(ConfigError, match=r"pip install 'nerfdiff\[cutout\]'"):
+        cut_out().find(tmp_path / "car.jpg")

@@ -1,0 +1,75 @@
+"""NerfDiff from Python, with the shipped model."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import nerfdiff
+from nerfdiff.api import _of_picture
+from nerfdiff.cli import load_config
+from nerfdiff.exports.views import render_rgba
+from nerfdiff.inputs import ASSETS
+from nerfdiff.utils.errors import ConfigError, DataError
+
+WAGON = ASSETS / "pictures" / "wagon.png"
+SMALL = ["budget.steps=1", "budget.sampler_steps=1", "budget.inner_steps=1", "budget.rays=64", "budget.views=2"]
+
+
+@pytest.fixture(scope="module")
+def model() -> nerfdiff.Model:
+    return nerfdiff.load("demo", device="cpu")
+
+
+@pytest.fixture(scope="module")
+def scene(model) -> nerfdiff.Scene:
+    return model.distil(WAGON, elevation=30, settings=[*SMALL, "picture_views.views=2"])
+
+
+def test_a_scene_shows_the_picture_and_its_other_sides(scene):
+    front, back = scene.render(), scene.render(180, elevation=10, height=32)
+    assert (front.mode, front.size, back.size) == ("RGBA", (64, 64), (32, 32))
+    pixels = np.asarray(front).astype(float) / 255
+    shown = pixels[..., :3] * pixels[..., 3:] + 1 - pixels[..., 3:]
+    assert np.abs(shown - np.asarray(scene.picture) / 255).mean() < 0.03
+    assert np.asarray(back)[..., 3].max() > 200
+
+
+def test_what_is_saved_is_the_scene(scene, tmp_path):
+    path = scene.save(tmp_path / "car.safetensors")
+    again = nerfdiff.load_scene(path, device="cpu")
+    assert np.array_equal(again.render(40), scene.render(40))
+    scene.orbit(tmp_path / "car.gif", frames=2, height=16)
+    again.save(tmp_path / "car.ply", "mesh.resolution=24", "mesh.colour_views=1", "points=100")
+    assert Image.open(tmp_path / "car.gif").n_frames == 2 and (tmp_path / "car.ply").stat().st_size > 1000
+
+
+def test_the_elevation_says_where_up_is(scene):
+    up = scene.saved.stands.up
+    assert torch.rad2deg(torch.atan2(-up[2], -up[1])) == pytest.approx(30, abs=0.1)
+    camera = scene.saved.stands.around(scene.saved.field.cameras, torch.zeros(1), torch.tensor([30.0]))
+    assert torch.allclose(camera.c2w, scene.saved.field.cameras.c2w, atol=1e-4)
+    assert render_rgba(scene.saved, camera, 16).shape == (1, 4, 16, 16)
+
+
+def test_pictures_are_framed_as_the_models_were(model):
+    chairs = replace(model.loaded, trained_on=[{"dataset": "srn_chairs"}])
+    cfg = load_config("picture", ["picture.object_share=0.5"])
+    framed = [_of_picture(cfg, WAGON, loaded).picture for loaded in (model.loaded, chairs)]
+    assert [(one.near, one.far, one.object_share) for one in framed] == [(0.8, 1.8, 0.5), (1.25, 2.75, 0.5)]
+    assert _of_picture(load_config("picture", []), WAGON, chairs).picture.object_share == 0.43
+
+
+def test_what_cannot_be_is_named(model, scene, tmp_path):
+    with pytest.raises(ConfigError, match="strategy=cdm leaves no scene"):
+        model.distil(WAGON, strategy="cdm", settings=["strategy.steps=1", "picture_views.views=2"])
+    with pytest.raises(ConfigError, match=r"expected one of \.safetensors, \.glb"):
+        scene.save(tmp_path / "car.fbx")
+    with pytest.raises(ConfigError, match=r"\.mp4 or \.gif"):
+        scene.orbit(tmp_path / "car.avi")
+    with pytest.raises(DataError, match="not a field saved by this project"):
+        nerfdiff.load_scene(WAGON)
+    with pytest.raises(AttributeError, match="no attribute 'lode'"):
+        nerfdiff.lode  # noqa: B018

@@ -1,0 +1,92 @@
+"""Pictures to folders of what a person opens next, with the shipped model."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nerfdiff.cli import load_config
+from nerfdiff.fit.saved_field import load_field
+from nerfdiff.inputs import ASSETS
+from nerfdiff.pictures import folders, pictures
+from nerfdiff.utils.errors import ConfigError, DataError
+from photographs import photograph
+
+SMALL = [
+    *("budget.steps=1", "budget.sampler_steps=1", "budget.inner_steps=1", "budget.rays=64", "budget.views=2"),
+    *(
+        "path.frames=2",
+        "height=16",
+        "mesh.resolution=24",
+        "mesh.colour_views=1",
+        "points=100",
+        "viewer.cells=8",
+        "progress_every=null",
+    ),
+]
+
+
+def made(tmp_path, *words: str):
+    return pictures(load_config("picture", [*SMALL, f"out={tmp_path / 'out'}", "device=cpu", *words]))
+
+
+@pytest.fixture
+def photo(tmp_path, monkeypatch):
+    monkeypatch.setenv("U2NET_HOME", str(tmp_path / "none"))
+    image = np.asarray(Image.open(ASSETS / "pictures" / "wagon.png").convert("RGB"))
+    photograph(image, (image < 242).any(-1), tmp_path / "my car.jpg", (150, 200), (0.5, 0.5), 0.75, 0)
+    return tmp_path / "my car.jpg"
+
+
+def test_a_photograph_becomes_a_folder(photo, tmp_path, caplog, capsys):
+    (car,) = made(tmp_path, f"images=['{photo}']", "elevation=8")
+    files = {"field.safetensors", "scene.json", "views.png", "orbit.mp4", "viewer.html", "my_car.glb", "my_car.ply"}
+    assert {path.name for path in car.iterdir()} == files | {"mask.png", "cutout.png"}
+    assert "my car.jpg: its background is neither transparent nor white; the object was cut out by its" in caplog.text
+    assert "mask=<image of its size" in caplog.text
+    up = load_field(car / "field.safetensors").stands.up
+    assert float(np.degrees(np.arctan2(-up[2], -up[1]))) == pytest.approx(8, abs=0.1)
+    said = capsys.readouterr().out
+    assert "next: look at" in said and f"field={car / 'field.safetensors'}" in said
+
+    # again: the scene is kept, lost files are made anew
+    before = (car / "field.safetensors").stat().st_mtime_ns
+    (car / "my_car.glb").unlink()
+    made(tmp_path, f"images=['{photo}']", "elevation=8", "format=[glb]")
+    assert (car / "my_car.glb").exists() and (car / "field.safetensors").stat().st_mtime_ns == before
+    # a mask of one's own is another scene
+    mask = Image.open(car / "mask.png")
+    mask.save(tmp_path / "own.png")
+    made(tmp_path, f"images=['{photo}']", f"mask={tmp_path / 'own.png'}", "elevation=8", "format=[ply]")
+    assert (car / "field.safetensors").stat().st_mtime_ns > before
+    assert json.loads((car / "scene.json").read_text())["picture"] == str(photo)
+
+
+def test_a_picture_that_fails_leaves_the_others(tmp_path, caplog):
+    Image.new("RGB", (40, 30), (90, 90, 90)).save(tmp_path / "grey.png")
+    wagon = ASSETS / "pictures" / "wagon.png"
+    with pytest.raises(DataError, match="1 of 2 pictures failed"):
+        made(tmp_path, f"images=['{tmp_path / 'grey.png'}','{wagon}']", "strategy=none", "format=[gif]")
+    assert "grey.png: no object stands out" in caplog.text
+    (folder,) = (tmp_path / "out").iterdir()
+    assert {path.name for path in folder.iterdir()} == {"field.safetensors", "scene.json", "views.png", "orbit.gif"}
+    assert folder.name == "wagon" and "wagon.png: its background" not in caplog.text
+
+
+def test_pictures_of_one_name_get_folders_of_their_own(tmp_path):
+    found = folders(["a/car.jpg", "b/car.png", "b/van.png", "c/car.jpg"], tmp_path)
+    assert [path.name for path in found] == ["car", "car_2", "van", "car_3"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "name a picture: "),
+        (["images=[a.png,b.png]", "mask=m.png"], "mask=m.png is of one picture, and there are 2"),
+        (["images=[a.png]", "format=[stl]"], "'stl'.*glb"),
+    ],
+)
+def test_what_cannot_be_is_said_first(tmp_path, words, said):
+    with pytest.raises(ConfigError, match=said):
+        made(tmp_path, *words)

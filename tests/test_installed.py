@@ -16,7 +16,8 @@ import nerfdiff
 PROJECT = Path(__file__).parents[1]
 SOURCES = ("pyproject.toml", "setup.py", "MANIFEST.in", "LICENSE", "README.md", "src", "conf", "assets")
 PIP = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
-COMMANDS = ("chart", "demo", "distill", "evaluate", "export", "inspect-data", "make-scenes", "picture", "train")
+FIRST = ("calibrate", "chart", "demo", "distill", "evaluate")
+COMMANDS = (*FIRST, "export", "inspect-data", "make-scenes", "picture", "train")
 
 
 @pytest.fixture(scope="module")

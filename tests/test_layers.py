@@ -13,7 +13,7 @@ LAYERS = (
     "utils", "stopping", "processes", "noise", "quoting", "limits", "inputs", "cli",
     "cameras", "poses", "trajectories", "data",
     "diffusion", "field", "render", "model", "averages", "checkpoint", "compilation",
-    "fit", "metrics", "results", "distill", "training",
+    "fit", "metrics", "results", "distill", "stress", "stability", "training",
     "evaluation", "exports", "inspection", "chart", "sweeps", "demo", "api", "pictures", "commands",
 )  # fmt: skip
 """Packages and modules of `nerfdiff`: each imports only from those before it. (`metrics` comes before `distill` and

@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 if TYPE_CHECKING:
     from nerfdiff.sweeps.proposals import Proposals
+    from nerfdiff.sweeps.stress_space import StressSpace
     from nerfdiff.sweeps.task import Task
 
 log = logging.getLogger(__name__)
@@ -30,6 +31,7 @@ class BudgetedSweeper(Sweeper):
         params: choices by key, in Hydra's syntax; those of the command line replace them.
         params_for: further ones, which hold where a config group (its name) has a choice (its name).
         proposals: which combinations.
+        space: makes the configurations in place of `params_for` and `indirect`; None: `space_of` does.
         minutes: after which no job begins; None is no limit.
         batch_size: configurations handed to the launcher at once, each with all seeds; None is all of them.
         retry: whether jobs that failed when the command ran before are run again.
@@ -41,6 +43,7 @@ class BudgetedSweeper(Sweeper):
         params: Mapping[str, str] | None,
         params_for: Mapping[str, Mapping[str, Mapping[str, str]]],
         proposals: "Proposals",
+        space: "StressSpace | None",
         minutes: float | None,
         batch_size: int | None,
         retry: bool,
@@ -48,6 +51,7 @@ class BudgetedSweeper(Sweeper):
     ):
         self.params, self.params_for, self.proposals = params or {}, params_for, proposals
         self.minutes, self.batch_size, self.retry, self.indirect = minutes, batch_size, retry, list(indirect)
+        self.make_space = space
         self.config: DictConfig | None = None
         self.hydra_context: HydraContext | None = None
         self.launcher: Launcher | None = None
@@ -87,14 +91,18 @@ class BudgetedSweeper(Sweeper):
         folder = Path(self.config.hydra.sweep.dir)
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(self.config, folder / "multirun.yaml")
-        space = space_of(
-            [f"{key}={value}" for key, value in self.params.items()],
-            self.params_for,
-            arguments,
-            lambda words: loader.load_sweep_config(self.config, words),
-            lambda key: bool(loader.get_group_options(key)),
-            self.indirect,
-        )
+        params = [f"{key}={value}" for key, value in self.params.items()]
+
+        def compose(words: list[str]) -> DictConfig:
+            return loader.load_sweep_config(self.config, words)
+
+        def is_group(key: str) -> bool:
+            return bool(loader.get_group_options(key))
+
+        if self.make_space is not None:
+            space = self.make_space(params, arguments, compose)
+        else:
+            space = space_of(params, self.params_for, arguments, compose, is_group, self.indirect)
         log.info("%d configurations in %s", len(space), folder)
         if self.minutes is not None:
             self.task.until = time.time() + 60 * self.minutes

@@ -33,3 +33,15 @@ def random_sphere(
     across = np.sqrt(1 - z**2)
     directions = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=1)
     return np.stack([look_at_origin(radius * d) for d in directions])
+
+
+def rings(radius: int | float, views: int, elevations: tuple[int | float, ...]) -> Float[np.ndarray, "views 4 4"]:
+    """Poses on circles of these elevations in degrees, in turn: each circle's are spread evenly."""
+    around = -(-views // len(elevations))
+    poses = []
+    for view in range(views):
+        elevation = np.radians(elevations[view % len(elevations)])
+        azimuth = 2 * np.pi * (view // len(elevations)) / around
+        across = np.cos(elevation)
+        poses.append([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])
+    return np.stack([look_at_origin(radius * np.array(direction)) for direction in poses])

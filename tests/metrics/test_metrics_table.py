@@ -28,7 +28,7 @@ def test_every_place_knows_every_metric():
     headings, (values,) = cells([row])
     shown = dict(zip(headings, values, strict=True))
     assert shown == {"strategy": "s"} | {m.heading: f"{1:.{m.digits}f}" for m in PACKAGE}
-    assert {"PSNR ↑", "FID ↓", "sharpness (1)", "of truth"} < set(headings)
+    assert {"PSNR ↑", "FID † ↓", "sharpness † (1)", "of truth"} < set(headings)
     assert [metric["field"] for metric in charted()] == [m.name for m in PACKAGE if m.within is not None]
     assert set(named("image", "scene", "run")) == {m.name for m in PACKAGE}
     assert accuracy_layout()["Accuracy"]["PSNR, dB"] == ["accuracy/psnr"]

@@ -129,7 +129,7 @@ def test_whole_scenes_have_rows_and_means(folder):
     assert b["floaters"] == b["depth_extent"] == b["consistency_psnr"] == b["consistency_psnr_truth"] == ""
     assert summary["consistency_n"] == 1 and summary["sharpness"] == pytest.approx(1)
     table = markdown([ResultRow(run_id="r", **summary)])
-    for heading in ("sharpness (1)", "floaters ↓", "depth extent (1)", "consistency PSNR ↑"):
+    for heading in ("sharpness † (1)", "floaters ↓", "depth extent (1)", "consistency PSNR † ↑"):
         assert heading in table
     assert json.loads((folder.parent / "scores" / "summary.json").read_text()) == summary
 

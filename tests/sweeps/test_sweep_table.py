@@ -182,9 +182,9 @@ def test_paper_numbers_stand_beside_ours(swept):
     assert found[2].paper == {"psnr": 23.51, "fid": 18.09} and found[0].paper == {}
     headings, _, *body = [line.strip("| ").split(" | ") for line in to_markdown(found).splitlines()[:5]]
     ngd = dict(zip(headings, body[2], strict=True))
-    assert (ngd["paper: PSNR ↑"], ngd["paper: FID ↓"]) == ("23.51", "18.09")
+    assert (ngd["paper: PSNR ↑"], ngd["paper: FID † ↓"]) == ("23.51", "18.09")
     assert ngd["PSNR ↑"].startswith("23.50 [21.50, 25.50") and ngd["Δ PSNR ↑"] == "+1.50 [+1.50, +1.50]"
-    assert ngd["FD ST-VGG ↓"] == "170.00 [160.00, 180.00]"
+    assert ngd["FD ST-VGG † ↓"] == "170.00 [160.00, 180.00]"
 
 
 def test_csv_and_terminal_show_every_line(swept):
@@ -288,7 +288,7 @@ def test_what_rows_say_is_text_everywhere(swept, tmp_path):
 
 
 def table(frontier=None, pause=0.0):
-    return SweepTable(["strategy"], {"strategy": "none"}, {}, [], BOOTSTRAP, frontier, pause)
+    return SweepTable(["strategy"], {"strategy": "none"}, {}, [], BOOTSTRAP, frontier, pause, True)
 
 
 def test_a_failure_that_no_row_tells_of_becomes_one(tmp_path, monkeypatch):

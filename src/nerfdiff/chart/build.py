@@ -25,8 +25,9 @@ from nerfdiff.chart.payload import (
 from nerfdiff.chart.pictures import SmallSheets
 from nerfdiff.chart.png import write_png
 from nerfdiff.chart.published import published_for, read_published
+from nerfdiff.chart.stability import stability_values
 from nerfdiff.cli import command_words
-from nerfdiff.metrics.table import METRICS
+from nerfdiff.metrics.table import METRICS, reward_note
 from nerfdiff.results.frame import (
     RESULTS,
     Run,
@@ -39,6 +40,8 @@ from nerfdiff.results.frame import (
 )
 from nerfdiff.results.row import COLUMNS, RowFile
 from nerfdiff.results.text import one_line, write_csv
+from nerfdiff.stability.study import studies
+from nerfdiff.stress.axes import stress_files
 from nerfdiff.utils.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
@@ -91,18 +94,21 @@ def build_chart(cfg: DictConfig) -> Path:
     out = Path(cfg.out) if cfg.out is not None else _folder(places[0]) / "chart"
     metrics, costs = charted(), _plain(cfg.costs)
     bootstrap = instantiate(cfg.bootstrap)
-    content = measured(configurations(found.runs, bootstrap, found.warn), metrics, costs, cfg.unnamed)
+    plain_runs = [run for run in found.runs if run.row.stress is None]  # stressed ones are no choice of speed
+    content = measured(configurations(plain_runs, bootstrap, found.warn), metrics, costs, cfg.unnamed)
     papers = read_published(cfg.published)
     published = [published_for(panel, **papers) for panel in content.panels]
-    failed = failures(found.runs)
+    failed = failures(plain_runs)
+    rules, breaking = (instantiate(cfg.verdicts[name]) for name in ("rules", "bootstrap"))
+    stability = stability_values(studies(found.runs, stress_files(), rules, breaking), out, cfg.pictures.strip_views)
 
     page = out / "index.html"
-    small = SmallSheets(**_plain(cfg.pictures), warn=found.warn)
+    small = SmallSheets(cfg.pictures.width, cfg.pictures.megabytes, cfg.pictures.megapixels, found.warn)
     values = _values(out, content, published, failed, small)
     write_csv(out / "configurations.csv", configuration_columns(), map(configuration_line, content.found))
     write_csv(out / "runs.csv", list(dict.fromkeys(("results", *COLUMNS, *METRICS))), run_lines(found.runs))
     pictures = _pngs(cfg, out, content, published)
-    counts = f"{len(found.runs)} runs, {len(content.found)} configurations, {len(failed)} failed runs"
+    counts = f"{len(found.runs)} runs, {len(content.found)} configurations, {len(failures(found.runs))} failed runs"
     write_page(
         page,
         cfg.title,
@@ -114,7 +120,9 @@ def build_chart(cfg: DictConfig) -> Path:
             "how": HOW.format(level=bootstrap.level),
             "webgl_above": cfg.webgl_above,
             "unread": found.unread,
-            "empty": _nothing(places, found, len(content.found)),
+            "stability": stability,
+            "rewards": reward_note(metric.heading for metric in METRICS.values() if metric.within is not None),
+            "empty": None if stability else _nothing(places, found, len(content.found)),
         },
     )
     log.info("page: %s   beside it: configurations.csv, runs.csv and %d PNGs", page, len(pictures))

@@ -12,7 +12,7 @@ from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.files import write_text
 
 PARTS = Path(__file__).parent / "page"
-SCRIPTS = ("state", "colours", "axes", "plot", "tip", "details", "pick", "cards", "table", "main")
+SCRIPTS = ("state", "colours", "axes", "plot", "tip", "details", "pick", "cards", "table", "stability", "main")
 
 
 def write_page(path: Path, title: str, content: dict[str, Any]) -> None:
@@ -22,7 +22,11 @@ def write_page(path: Path, title: str, content: dict[str, Any]) -> None:
         DataError: the file cannot be written.
         ConfigError: plotly or itables is not installed.
     """
-    libraries = _libraries() if content["panels"] else dict.fromkeys(("plotly", "table_style", "table_script"), "")
+    libraries = (
+        _libraries()
+        if content["panels"] or content["stability"]
+        else dict.fromkeys(("plotly", "table_style", "table_script"), "")
+    )
     parts = {
         "title": html.escape(title),
         "style": _part("style.css"),

@@ -12,7 +12,7 @@ import numpy as np
 from nerfdiff.chart.labels import labels_of, names_of
 from nerfdiff.chart.panels import Panel, panels_of
 from nerfdiff.chart.pictures import links
-from nerfdiff.metrics.table import METRICS
+from nerfdiff.metrics.table import MARK, METRICS
 from nerfdiff.results.frame import Configuration, Run, newest
 from nerfdiff.results.frontier import frontier
 from nerfdiff.results.intervals import Estimate
@@ -44,7 +44,14 @@ class Measured:
 def charted() -> list[dict[str, Any]]:
     """The metrics that the page can show, as it has them; what a cost has too is called the same."""
     return [
-        {"field": m.name, "name": m.label, "unit": m.unit, "better": m.better, "within": m.within, "digits": m.digits}
+        {
+            "field": m.name,
+            "name": f"{m.label}{MARK if m.rewards else ''}",
+            "unit": m.unit,
+            "better": m.better,
+            "within": m.within,
+            "digits": m.digits,
+        }
         for m in METRICS.values()
         if m.within is not None
     ]

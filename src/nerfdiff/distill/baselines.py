@@ -10,6 +10,7 @@ from lightning import Callback
 from torch import Tensor
 
 from nerfdiff.data.batch import ViewBatch
+from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.distill.strategy import PredictedViews
 from nerfdiff.model import NerfDiff
@@ -50,3 +51,8 @@ def mean_training_image(reader: SceneReader, scenes: int, seed: int) -> Float[Te
     order = torch.randperm(len(reader), generator=generator("cpu", seed, "mean image"))
     means = [reader.load(int(index)).images.mean(0) for index in order[:scenes]]
     return torch.stack(means).mean(0)
+
+
+def mean_image(data: SceneDataModule, scenes: int, seed: int, name: str) -> MeanImage:
+    """Return the baseline of a dataset's training images, see `mean_training_image`."""
+    return MeanImage(mean_training_image(data.reader("train"), scenes, seed), name)

@@ -2,6 +2,7 @@
 
 import logging
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from statistics import fmean
 from typing import Any
 
@@ -13,6 +14,7 @@ from nerfdiff.evaluation.run import EvaluationRun
 from nerfdiff.field import cpu_field
 from nerfdiff.render import backend
 from nerfdiff.results.row import Timing
+from nerfdiff.stability.judge import OK
 from nerfdiff.utils.timing import cost_of_a_piece, summarise
 
 log = logging.getLogger(__name__)
@@ -22,12 +24,12 @@ STABILITY = ("nonfinite_grad_steps", "loss_spikes", "grad_norm_p99")
 
 
 def cost_fields(run: EvaluationRun, strategy: Strategy) -> dict[str, Any]:
-    """Return the cost fields of a row, with `model_fields`, the backend, K, and how many scenes fell back.
+    """Return the cost fields of a row, with `model_fields`, the backend, K, fallbacks and the judge's verdict.
 
     A baseline, which runs no model, has counts alone.
     """
     scenes = costs(run, strategy)
-    fields: dict[str, Any] = {
+    fields: dict[str, Any] = _verdict(scenes) | {
         "denoiser_calls": sum(int(cost["denoiser_calls"]) for cost in scenes),
         "field_queries": sum(int(cost["field_queries"]) for cost in scenes),
     }
@@ -51,6 +53,16 @@ def cost_fields(run: EvaluationRun, strategy: Strategy) -> dict[str, Any]:
     if fallen:
         fields["error"] = "fell back: " + ", ".join(f"{count} scenes {status}" for status, count in fallen.items())
     return fields | {"fallbacks": fallen.total()}
+
+
+def _verdict(scenes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Count the scenes that the judge suspects, and say why; nothing where it did not look at all of them."""
+    said = [scene["verdict"] for scene in scenes]
+    if None in said:
+        return {}
+    suspect = Counter(why for verdict in said if verdict != OK for why in (verdict.removeprefix("suspect: "),))
+    told = "; ".join(f"{count} of {len(said)} {why}" for why, count in suspect.items())
+    return {"suspects": suspect.total(), "verdict": f"suspect: {told}" if told else OK}
 
 
 def model_fields(run: EvaluationRun) -> dict[str, Any]:

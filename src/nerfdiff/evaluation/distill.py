@@ -18,11 +18,12 @@ from nerfdiff.evaluation.dashboard import show_in_dashboard
 from nerfdiff.evaluation.evaluate import show
 from nerfdiff.evaluation.measure import measure, record_failure
 from nerfdiff.evaluation.pictures import sheet
-from nerfdiff.evaluation.predict import done, predict, require_all
+from nerfdiff.evaluation.predict import costs, done, predict, require_all
 from nerfdiff.evaluation.run import EvaluationRun, choose_device, dataset_run, picture_run
 from nerfdiff.processes import end_launched, lost_process, watch
 from nerfdiff.results.row import ResultRow
 from nerfdiff.stopping import Stopped
+from nerfdiff.stress.stress import with_stress
 from nerfdiff.utils.config import plain
 from nerfdiff.utils.errors import ConfigError, ProcessLost
 
@@ -45,9 +46,10 @@ def distill(cfg: DictConfig) -> ResultRow | None:
     """
     run, strategy = None, None
     try:
+        cfg = with_stress(cfg, "distill")
         fabric = _launch(cfg)
         run = picture_run(cfg, fabric.device) if cfg.image else dataset_run(cfg, fabric.device)
-        strategy, scorer = build_strategy(cfg), None if cfg.image else instantiate(cfg.metrics)
+        strategy, scorer = run.stressed(build_strategy(cfg)), None if cfg.image else instantiate(cfg.metrics)
         _predict_together(fabric, run, strategy)
         if fabric.global_rank > 0:
             return None
@@ -69,6 +71,8 @@ def distill(cfg: DictConfig) -> ResultRow | None:
     if row is not None:
         show_in_dashboard(cfg, [row], pictures)
         show([row], run.folder / "table.md")
+    if cfg.image:
+        log.info("verdict: %s", costs(run, strategy)[0]["verdict"])
     log.info("fields, traces and orbits: %s", run.predictions / strategy.name)
     return row
 

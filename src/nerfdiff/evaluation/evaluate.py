@@ -21,6 +21,7 @@ from nerfdiff.evaluation.run import choose_device, dataset_run
 from nerfdiff.results.row import ResultRow
 from nerfdiff.results.table import rich_table, write_markdown
 from nerfdiff.stopping import Stopped
+from nerfdiff.stress.stress import with_stress
 
 log = logging.getLogger(__name__)
 
@@ -39,11 +40,15 @@ def evaluate(cfg: DictConfig) -> list[ResultRow]:
     Raises:
         UserError: bad data, config or checkpoint. A strategy that fails is appended as a row with its status first.
     """
+    cfg = with_stress(cfg, "distill")
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
     run = dataset_run(cfg, choose_device(cfg.device))
     reader = run.data.reader("test")
-    strategies: list[Strategy] = [instantiate(cfg.strategy), *(_baselines(cfg, run.data) if cfg.baselines else ())]
+    strategies: list[Strategy] = [
+        run.stressed(instantiate(cfg.strategy)),
+        *(_baselines(cfg, run.data) if cfg.baselines else ()),
+    ]
     scorer = instantiate(cfg.metrics)
     rows = []
     for strategy in strategies:

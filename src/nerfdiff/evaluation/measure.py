@@ -106,7 +106,7 @@ def _identified(run: EvaluationRun, strategy: Strategy) -> ResultRow:
 
 def _asked_for(settings: RunSettings) -> dict[str, Any]:
     """Return the fields that the settings and the command tell."""
-    known = {"seed": settings.seed, "dataset": settings.dataset}
+    known = {name: getattr(settings, name) for name in ("seed", "dataset", "stress", "severity", "neutral")}
     if not HydraConfig.initialized():
         return known
     return known | {"overrides": list(HydraConfig.get().overrides.task), "command": _command(HydraConfig.get())}

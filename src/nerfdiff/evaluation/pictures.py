@@ -11,6 +11,7 @@ from nerfdiff.evaluation.run import EvaluationRun
 from nerfdiff.metrics.predictions import read_prediction
 from nerfdiff.metrics.score import truth_from
 from nerfdiff.results.pictures import colour_depth, contact_sheet, orbit_video
+from nerfdiff.stability.judge import OK
 
 
 def sheet(run: EvaluationRun, strategies: Sequence[Strategy], path: Path) -> Path:
@@ -29,7 +30,8 @@ def sheet(run: EvaluationRun, strategies: Sequence[Strategy], path: Path) -> Pat
         main = predictions[strategies[0].name]
         n = len(main.views)
         shown = [(2 * i + 1) * n // (2 * options.views) for i in range(min(n, options.views))]
-        names += [f"{scene[:10]} {main.views[i]}" for i in shown]
+        suspect = " ?" if (main.verdict or OK) != OK else ""  # the row and the log say why
+        names += [f"{scene[:10]} {main.views[i]}{suspect}" for i in shown]
         add("input", batch.source.expand(len(shown), -1, -1, -1))
         if truth:
             add("truth", truth(scene, [main.views[i] for i in shown]).images)

@@ -23,6 +23,7 @@ from nerfdiff.fit.saved_field import FIELD, SavedField, load_field, save_field
 from nerfdiff.metrics.image import psnr
 from nerfdiff.metrics.predictions import SCENE, PredictionWriter
 from nerfdiff.results.pictures import orbit_video
+from nerfdiff.stability.judge import OK
 from nerfdiff.trajectories import Upright, orbit
 from nerfdiff.utils.errors import ConfigError, TimeUp, some
 from nerfdiff.utils.memory import peak_memory
@@ -124,6 +125,13 @@ def _write(
     spent: Mapping[str, float],
 ) -> float | None:
     """Save one scene's views, and what was `spent` on it, see `_shares`; their PSNR, if there is a truth."""
+    verdict, signs = None, None
+    if run.judge is not None:
+        with run.autocast():
+            signs = run.judge.signs(run.model, scene, views, run.familiar, run.settings.seed)
+        verdict = run.judge.verdict(signs, views.status)
+        if verdict != OK:
+            log.warning("%s of scene %s is %s", strategy.name, scene.scene_ids[0], verdict)
     writer.write(
         scene.scene_ids[0],
         scene.target_views[0],
@@ -140,6 +148,8 @@ def _write(
             "virtual_views": views.virtual_views,
         },
         status=views.status,
+        verdict=verdict,
+        signs=signs,
         beside=partial(_leave, run, strategy, scene, views),
     )
     return psnr(views.images.clamp(0, 1), scene.targets[0]).mean().item() if run.data else None
@@ -180,10 +190,10 @@ def saved_field(run: EvaluationRun, strategy: Strategy, scene_id: str) -> SavedF
 
 
 def costs(run: EvaluationRun, strategy: Strategy) -> list[dict[str, Any]]:
-    """Return each scene's costs and status."""
+    """Return each scene's costs, status and verdict."""
     folder = _writer(run, strategy).folder
     facts = [json.loads((folder / scene / SCENE).read_text()) for scene in run.scene_ids]
-    return [fact["cost"] | {"status": fact["status"]} for fact in facts]
+    return [fact["cost"] | {"status": fact["status"], "verdict": fact.get("verdict")} for fact in facts]
 
 
 def _peak_memory(device: torch.device) -> int:

@@ -18,15 +18,19 @@ from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.diffusion.denoiser import cast_products
 from nerfdiff.diffusion.layout import channels_last
+from nerfdiff.distill.strategy import Strategy
 from nerfdiff.model import NerfDiff
 from nerfdiff.results.environment import hardware
+from nerfdiff.stability.familiar import FAMILIAR, Familiar
+from nerfdiff.stability.judge import Judge
+from nerfdiff.stress.stress import Stress, stress_of
 from nerfdiff.utils.config import auto_precision, plain
 from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.hashes import sha256_file, sha256_values
 
 log = logging.getLogger(__name__)
 
-PRECISIONS = ("32-true", "bf16-mixed")
+PRECISIONS = {"32-true": None, "bf16-mixed": torch.bfloat16, "16-mixed": torch.float16}
 SAMPLES = ("uniform_samples", "importance_samples")
 
 
@@ -59,6 +63,7 @@ class RunSettings:
         minutes: after which no scene begins.
         progress_every: seconds between lines where there is no terminal.
         per_scene: leave every scene's field, trace and orbit beside its views.
+        stress, severity, neutral: what goes wrong on purpose, by how much, and how much is nothing; None: nothing.
     """
 
     run_name: str
@@ -73,10 +78,14 @@ class RunSettings:
     per_scene: bool
     orbit: Orbit
     sheet: Sheet
+    stress: str | None
+    severity: float | None
+    neutral: float | None
 
     @staticmethod
     def of(cfg: DictConfig) -> "RunSettings":
         """Read the settings of a composed config."""
+        stress = stress_of(cfg)
         same = ("run_name", "seed", "scenes_at_once", "minutes", "progress_every", "per_scene")
         return RunSettings(
             **{name: cfg[name] for name in same},
@@ -86,6 +95,9 @@ class RunSettings:
             compiled=cfg.compile != "none",
             orbit=instantiate(cfg.orbit),
             sheet=instantiate(cfg.sheet),
+            stress=stress and stress.axis,
+            severity=None if stress is None else float(stress.severity),
+            neutral=None if stress is None or stress.neutral is None else float(stress.neutral),
         )
 
 
@@ -102,6 +114,9 @@ class EvaluationRun:
             threads, scenes at once, the renderer's chunks and the memory layout.
         rows_before: bytes of the file of results before this run.
         data: where the scenes come from; None for a picture, whose other views nobody knows.
+        judge: says of every scene whether its views can be trusted; None: nothing does.
+        familiar: what the judge knows of the model's training images; None: nothing.
+        stress: of the scenes, whose input `load` gives with it, and of the strategy; None: none.
     """
 
     settings: RunSettings
@@ -116,21 +131,28 @@ class EvaluationRun:
     cost_key: str
     rows_before: int
     data: SceneDataModule | None
+    judge: Judge | None
+    familiar: Familiar | None
+    stress: Stress | None
 
     @property
     def predictions(self) -> Path:
         return self.folder / "predictions"
+
+    def stressed(self, strategy: Strategy) -> Strategy:
+        """Return the strategy with this run's stress, where it acts on virtual views or targets."""
+        return strategy if self.stress is None else self.stress.strategy(strategy, self.load, self.scene_ids)
 
     def autocast(self) -> AbstractContextManager:
         return autocast(self.device, self.precision)
 
 
 def autocast(device: torch.device, precision: str) -> AbstractContextManager:
-    """Compute products in bf16 where the precision asks for it."""
-    if precision == "32-true":
+    """Compute products in halves where the precision asks for it."""
+    if (halves := PRECISIONS[precision]) is None:
         return nullcontext()
-    # Without the cache: it would keep the first bf16 copy of parameters that a strategy fits.
-    return torch.autocast(device.type, torch.bfloat16, cache_enabled=False)
+    # Without the cache: it would keep the first half copy of parameters that a strategy fits.
+    return torch.autocast(device.type, halves, cache_enabled=False)
 
 
 def choose_device(name: str) -> torch.device:
@@ -174,6 +196,8 @@ def dataset_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
     datamodule.setup("test")
     reader = datamodule.reader("test")
     scene_ids = [reader.scene_id(index) for index in datamodule.test_set.indices]
+    if (stress := stress_of(cfg)) is not None:
+        stress.inputs(datamodule.test_set)
     position = {name: index for index, name in enumerate(scene_ids)}
 
     def load(names: Sequence[str]) -> Iterable[ViewBatch]:
@@ -194,7 +218,7 @@ def dataset_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
         "image_size": size,
         "mean_image_scenes": cfg.get("mean_image_scenes"),  # a baseline of evaluate.py
     }
-    return _run(cfg, device, loaded, load, scene_ids, facts, datamodule)
+    return _run(cfg, device, loaded, load, scene_ids, facts, datamodule, stress)
 
 
 def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
@@ -207,6 +231,8 @@ def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
     size = loaded.image_size or plain(cfg.picture_size)
     if size is None:
         raise ConfigError(f"{loaded.path} does not say what image size it is for: give picture_size=[height,width]")
+    if (stress := stress_of(cfg)) is not None and stress.input_view is not None:
+        raise ConfigError(f"stress={stress.axis} chooses another input view, and a picture has none")
     scene = picture_scene(cfg, size)
     facts = {
         "split_sha256": sha256_values(list(scene.scene_ids)),
@@ -215,7 +241,7 @@ def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
         "picture_views": plain(cfg.picture_views),
         "image_size": list(size),
     }
-    return _run(cfg, device, loaded, lambda names: [scene] * len(names), list(scene.scene_ids), facts, None)
+    return _run(cfg, device, loaded, lambda names: [scene] * len(names), list(scene.scene_ids), facts, None, stress)
 
 
 def picture_scene(cfg: DictConfig, size: Sequence[int], where: np.ndarray | None = None) -> ViewBatch:
@@ -243,23 +269,28 @@ def _run(
     scene_ids: list[str],
     facts: dict[str, Any],
     data: SceneDataModule | None,
+    stress: Stress | None,
 ) -> EvaluationRun:
     precision = cfg.precision if cfg.precision != "auto" else auto_precision(device.type)
     if precision not in PRECISIONS:
-        raise ConfigError(f"precision must be auto, {' or '.join(PRECISIONS)}, got {precision!r}")
-    identity = facts | {
-        "ckpt_sha256": sha256_file(loaded.path),
-        "weights": loaded.weights,
-        "seed": cfg.seed,
-        "precision": precision,
-        "kernel_precision": cfg.kernel_precision,
-        "backend": cfg.backend,
-        "compile": cfg.compile,
-        "samples": {name: getattr(loaded.model.renderer, name) for name in SAMPLES},
-        "device": device.type,  # whose generators draw the noise
-        "orbit": cfg.per_scene and cfg.orbit.frames,
-        "strategy": plain(cfg.strategy),
-    }
+        raise ConfigError(f"precision must be auto, {', '.join(PRECISIONS)}, got {precision!r}")
+    identity = (
+        facts
+        | {
+            "ckpt_sha256": sha256_file(loaded.path),
+            "weights": loaded.weights,
+            "seed": cfg.seed,
+            "precision": precision,
+            "kernel_precision": cfg.kernel_precision,
+            "backend": cfg.backend,
+            "compile": cfg.compile,
+            "samples": {name: getattr(loaded.model.renderer, name) for name in SAMPLES},
+            "device": device.type,  # whose generators draw the noise
+            "orbit": cfg.per_scene and cfg.orbit.frames,
+            "strategy": plain(cfg.strategy),
+        }
+        | (stress.identity if stress is not None else {})
+    )
     folder = Path(cfg.paths.output_dir) / f"{cfg.strategy.name}-{sha256_values(identity)[:8]}"
     model = loaded.model.to(device).requires_grad_(False)
     in_pixels = channels_last(cfg.channels_last, device, cfg.compile != "none")
@@ -270,10 +301,11 @@ def _run(
     compile_unets(model, cfg.compile, cfg.paths.compiled_dir)
     spent_on = [hardware(device), cfg.threads, cfg.scenes_at_once, model.renderer.chunk, in_pixels]
     settings = RunSettings.of(cfg)
+    familiar = loaded.path.parent / FAMILIAR
     return EvaluationRun(
         settings=settings,
         model=model,
-        load=load,
+        load=load if stress is None else stress.on(load),
         scene_ids=scene_ids,
         device=device,
         precision=precision,
@@ -283,4 +315,7 @@ def _run(
         cost_key=sha256_values(spent_on)[:8],
         rows_before=settings.results.stat().st_size if settings.results.is_file() else 0,
         data=data,
+        judge=instantiate(cfg.judge),
+        familiar=Familiar.load(familiar) if familiar.is_file() else None,
+        stress=stress,
     )

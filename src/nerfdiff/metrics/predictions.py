@@ -28,7 +28,7 @@ from torch import Tensor
 
 from nerfdiff.metrics.image import quantise
 from nerfdiff.utils.errors import DataError
-from nerfdiff.utils.files import publish, remove_leftovers, write_text
+from nerfdiff.utils.files import encode, publish, remove_leftovers, write_text
 
 FORMAT = 2
 PLAN = "plan.json"
@@ -49,6 +49,7 @@ class Prediction:
         source_views: names of the views the model was given.
         cost: what the writer measured (seconds, counts).
         status: `ok`, or why the method fell back to something else.
+        verdict: of the judge; None where it did not look.
     """
 
     scene_id: str
@@ -59,6 +60,7 @@ class Prediction:
     opacity: Float[Tensor, "views h w"] | None
     cost: dict[str, Any]
     status: str
+    verdict: str | None
 
 
 class PredictionWriter:
@@ -142,6 +144,8 @@ class PredictionWriter:
         opacity: Float[Tensor, "views h w"] | None = None,
         cost: Mapping[str, Any] | None = None,
         status: str = "ok",
+        verdict: str | None = None,
+        signs: Mapping[str, float] | None = None,
         beside: Callable[[Path], object] | None = None,
     ) -> Path:
         """Save one scene, whole or not at all.
@@ -151,6 +155,7 @@ class PredictionWriter:
             depth: along z in scene units (see `depth.z_depth`); needs `opacity`.
             cost: seconds, counts and conditions of this scene, so that a resumed evaluation still knows them.
             status: `ok`, or why the method fell back to something else.
+            verdict, signs: of the judge.
             beside: writes further files into the scene's folder, which appears only when they are there too.
 
         Raises:
@@ -173,6 +178,8 @@ class PredictionWriter:
             "depth": depth is not None,
             "cost": dict(cost or {}),
             "status": status,
+            "verdict": verdict,
+            "signs": None if signs is None else encode(dict(signs)),
         }
         final, partial = self.folder / scene_id, self.folder / f".{scene_id}.{os.getpid()}.tmp"
         try:
@@ -226,7 +233,15 @@ def read_prediction(folder: Path, scene_id: str) -> Prediction:
         arrays = [_read_npz(scene / "depth" / f"{view}.npz") for view in views]
         depth, opacity = (torch.stack(values) for values in zip(*arrays, strict=True))
     return Prediction(
-        scene_id, views, tuple(facts["source_views"]), pixels, depth, opacity, facts["cost"], facts["status"]
+        scene_id,
+        views,
+        tuple(facts["source_views"]),
+        pixels,
+        depth,
+        opacity,
+        facts["cost"],
+        facts["status"],
+        facts.get("verdict"),  # not in scenes from before there was a judge
     )
 
 

@@ -181,7 +181,7 @@ class _Session:
                 folder / scene_id / FIELD,
                 self.device,
             )
-        return SceneScores(scene_id, prediction.views, blank, values, whole, prediction.status)
+        return SceneScores(scene_id, prediction.views, blank, values, whole, prediction.status, prediction.verdict)
 
     def _batch(
         self, pixels: UInt8[Tensor, "n 3 h w"], true_pixels: UInt8[Tensor, "n 3 h w"]

@@ -11,7 +11,7 @@ from nerfdiff.metrics.table import METRICS, PACKAGE, named
 from nerfdiff.utils.errors import DataError
 from nerfdiff.utils.files import atomic
 
-FACTS = ("scene", "views", "status", "blank")  # of a scene, beside its metrics
+FACTS = ("scene", "views", "status", "verdict", "blank")  # of a scene, beside its metrics
 LARGEST = 2**21  # bytes of a file of scores: of some 10,000 scenes
 
 Value = float | int | str | None
@@ -26,6 +26,7 @@ class SceneScores:
         values: for each metric of images that was measured, one value (or None) per view.
         whole: those of whole scenes that were measured.
         status: `ok`, or why the method fell back to something else.
+        verdict: of the judge.
     """
 
     scene_id: str
@@ -34,6 +35,7 @@ class SceneScores:
     values: Mapping[str, Sequence[float | None]]
     whole: Mapping[str, float | None] = field(default_factory=dict)
     status: str = "ok"
+    verdict: str | None = None
 
     def mean(self, metric: str) -> float | None:
         return self.whole.get(metric) if METRICS[metric].per == "scene" else _mean(self.values.get(metric, ()))
@@ -46,7 +48,7 @@ class SceneScores:
         return rows
 
     def row(self) -> dict[str, Value]:
-        facts = (self.scene_id, len(self.views), self.status, int(self.blank))
+        facts = (self.scene_id, len(self.views), self.status, self.verdict, int(self.blank))
         return dict(zip(FACTS, facts, strict=True)) | {m: self.mean(m) for m in named("image", "scene")}
 
 

@@ -1,7 +1,7 @@
 """The metrics, each with all that rows, tables, dashboards and the chart say of it."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -9,6 +9,8 @@ from nerfdiff.utils.errors import ConfigError
 
 ARROWS = {"higher": " ↑", "lower": " ↓", "one": " (1)", None: ""}
 PER = ("image", "scene", "run")
+MARK = " †"
+REPEATS = "one image repeated and views of other scenes"
 LONGEST = 60  # letters of a label or unit
 
 
@@ -26,6 +28,7 @@ class Metric:
         within: distance from the best at which the chart's advice begins; None leaves the metric out of the chart.
         compared: sweeps show differences to their reference and the frontier for it, and blank scenes are told apart.
         detail: TensorBoard shows it among the details.
+        rewards: what failure it rewards (docs/stability.md); None where none is known.
         measure: of your own metric: images [n, 3, h, w] in [0, 1], predicted and true, to values [n].
 
     Raises:
@@ -41,6 +44,7 @@ class Metric:
     within: float | None = None
     compared: bool = False
     detail: bool = False
+    rewards: str | None = None
     measure: Callable[..., Any] | None = field(default=None, compare=False)
 
     def __post_init__(self):
@@ -62,8 +66,8 @@ class Metric:
 
     @property
     def heading(self) -> str:
-        """The label with an arrow to where it is better."""
-        return f"{self.label}{ARROWS[self.better]}"
+        """The label, a mark where the metric rewards a failure, and an arrow to where it is better."""
+        return f"{self.label}{MARK if self.rewards else ''}{ARROWS[self.better]}"
 
     @property
     def format(self) -> str:
@@ -92,16 +96,24 @@ METRICS = _table(
     Metric("ssim", "SSIM", within=0.005, compared=True),
     Metric("ssim_gaussian", "SSIM (Gaussian)"),
     Metric("lpips", "LPIPS", "lower", within=0.005, compared=True),
-    Metric("fid", "FID", "lower", digits=2, per="run", within=1.0),
+    Metric("fid", "FID", "lower", digits=2, per="run", within=1.0, rewards="views of other scenes"),
     Metric("st_lpips_vgg", "ST-LPIPS", "lower", within=0.005, compared=True),
-    Metric("fd_st_vgg", "FD ST-VGG", "lower", digits=2, per="run", within=5.0),
-    Metric("sharpness", "sharpness", "one", digits=2, detail=True),
+    Metric("fd_st_vgg", "FD ST-VGG", "lower", digits=2, per="run", within=5.0, rewards=REPEATS),
+    Metric("sharpness", "sharpness", "one", digits=2, detail=True, rewards="speckle on blur"),
     Metric("depth_abs_rel", "depth abs rel", "lower", within=0.002, detail=True),
     Metric("depth_rmse", "depth RMSE", "lower", detail=True),
     Metric("mask_iou", "mask IoU", detail=True),
     Metric("floaters", "floaters", "lower", per="scene", within=0.01, detail=True),
     Metric("depth_extent", "depth extent", "one", digits=2, per="scene", detail=True),
-    Metric("consistency_psnr", "consistency PSNR", unit="dB", digits=2, per="scene", within=0.5, detail=True),
+    Metric(
+        *("consistency_psnr", "consistency PSNR"),
+        unit="dB",
+        digits=2,
+        per="scene",
+        within=0.5,
+        detail=True,
+        rewards="white views and blur",
+    ),
     Metric("consistency_psnr_truth", "of truth", None, "dB", digits=2, per="scene", detail=True),
 )
 """By name, in the order in which all show them. `register` adds those that come with a config or with a row."""
@@ -140,3 +152,14 @@ def own(settings: Mapping[str, Mapping[str, Any]]) -> list[Metric]:
 def named(*per: str) -> list[str]:
     """Names of the metrics of which an image, a scene or a run has a value."""
     return [metric.name for metric in METRICS.values() if metric.per in per]
+
+
+def reward_note(headings: Iterable[str]) -> str | None:
+    """Return words on those metrics under `headings` that reward a failure; None where none does."""
+    shown = tuple(headings)
+    told = [
+        f"{metric.label} rewards {metric.rewards}"
+        for metric in METRICS.values()
+        if metric.rewards and any(metric.heading in heading for heading in shown)
+    ]
+    return f"†: {'; '.join(told)}. Read it beside the others." if told else None

@@ -26,6 +26,7 @@ COSTS = (*TIMINGS, *COUNTS, *SIZES)
 IDENTITY = (
     "dataset", "split_sha256", "n_scenes", "n_views", "image_size", "ckpt_sha256", "weights", "model", "field",
     "strategy", "prior", "K", "samples_per_ray", "backend", "compile", "scenes_at_once", "precision", "device", "cpu",
+    "stress", "severity",
 )  # fmt: skip
 
 

@@ -51,6 +51,13 @@ class Bootstrap:
             low, high = np.quantile(values[drawn].mean(axis=1), [tails, 1 - tails])
         return Estimate(mean, float(low), float(high))
 
+    def means(self, values: Float[np.ndarray, "seeds scenes"]) -> Float[np.ndarray, "resamples"]:
+        """The mean over seeds and scenes of every draw of both; for as many of both, the draws are the same."""
+        seeds, scenes = values.shape
+        scene_shares, seed_shares = _draws(self.seed, self.resamples, scenes, seeds)
+        with np.errstate(invalid="ignore"):
+            return ((seed_shares @ values) * scene_shares).sum(axis=1)
+
     def over_seeds_and_scenes(self, values: Float[np.ndarray, "metrics seeds scenes"]) -> list[Estimate]:
         """Per metric the mean over seeds and scenes and its interval: both are drawn, each independently of the other.
 
@@ -61,13 +68,11 @@ class Bootstrap:
             means = values.mean(axis=(1, 2))
         if seeds * scenes < 2:
             return [Estimate(float(mean)) for mean in means]
-        scene_shares, seed_shares = _draws(self.seed, self.resamples, scenes, seeds)
         tails = (1 - self.level) / 2
         found = []
         for mean, own in zip(means, values, strict=True):
             with np.errstate(invalid="ignore"):
-                drawn = ((seed_shares @ own) * scene_shares).sum(axis=1)
-                low, high = np.quantile(drawn, [tails, 1 - tails])
+                low, high = np.quantile(self.means(own), [tails, 1 - tails])
             found.append(Estimate(float(mean), float(low), float(high)))
         return found
 

@@ -73,6 +73,9 @@ class _Identity:
     backend: str | None = None
     compile: bool | None = None
     scenes_at_once: int | None = None
+    stress: str | None = None
+    severity: float | None = None
+    neutral: float | None = None
 
 
 _WITHOUT_BLANK = [f"{metric.name}_without_blank" for metric in PACKAGE if metric.compared]
@@ -83,6 +86,7 @@ _NUMBERS = [(name, float | None, None) for name in (*(metric.name for metric in 
 class ResultRow(make_dataclass("_Measured", _NUMBERS, bases=(_Identity,), kw_only=True, slots=True)):
     """One measured run. None means not measured or not applicable.
 
+    `stress` is what went wrong on purpose, `severity` by how much in its own unit, `neutral` the severity of no stress.
     `folder` is where predictions and scores lie, relative to the file of results. `command` makes the row again.
     Timings are dicts {n, median, iqr} in seconds, see `timing`: `encode_s` per image, `render_s` per view (of all
     predicted views of a scene in one call), the others per scene. `scene_s` is a scene from its input image to all its
@@ -94,8 +98,9 @@ class ResultRow(make_dataclass("_Measured", _NUMBERS, bases=(_Identity,), kw_onl
     order that suits a CPU. `samples_per_ray` counts coarse and fine ones. `K` counts the virtual views that fields were
     fitted to, the most of any scene. `fid_n` is the number of images on either side of `fid` and `fd_st_vgg`; `n_views`
     counts all scored images; `consistency_n` scenes were measured for consistency. `fallbacks` counts the scenes whose
-    distillation failed and which kept an earlier field; `error` says how; where all did, the status is `diverged`. The
-    three after it are of the training run that made the checkpoint.
+    distillation failed and which kept an earlier field; `error` says how; where all did, the status is `diverged`.
+    `suspects` counts the scenes that the judge suspects, and `verdict` is `ok`, or says of how many what it suspects.
+    The last three are of the training run that made the checkpoint.
     """
 
     # metrics, beside those of `METRICS`
@@ -128,6 +133,8 @@ class ResultRow(make_dataclass("_Measured", _NUMBERS, bases=(_Identity,), kw_onl
     hydra: str | None = None
     # stability
     fallbacks: int | None = None
+    suspects: int | None = None
+    verdict: str | None = None
     nonfinite_grad_steps: int | None = None
     loss_spikes: int | None = None
     grad_norm_p99: float | None = None

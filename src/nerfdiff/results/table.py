@@ -8,7 +8,7 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from nerfdiff.metrics.table import METRICS
+from nerfdiff.metrics.table import METRICS, reward_note
 from nerfdiff.results.row import ResultRow, flatten
 from nerfdiff.results.text import markdown_lines, one_line
 from nerfdiff.utils.files import write_text
@@ -83,6 +83,7 @@ def rich_table(rows: Sequence[ResultRow], width: int, title: str | None = None) 
         if left >= 0 or not shown:
             shown.append((heading, values, needed))
     notes = [", ".join(f"{heading} {value}" for heading, value in same)]
+    notes.append(reward_note(heading for heading, *_ in shown))
     if len(shown) < len(columns):
         notes.append("too narrow for: " + ", ".join(heading for heading, _ in columns[len(shown) :]))
     caption = Text("\n".join(filter(None, notes)))  # names may have brackets, which are no markup
@@ -98,7 +99,8 @@ def rich_table(rows: Sequence[ResultRow], width: int, title: str | None = None) 
 def markdown(rows: Sequence[ResultRow]) -> str:
     """A Markdown table, ending in a newline."""
     headings, body = cells(rows)
-    return markdown_lines([headings, *body])
+    note = reward_note(headings)
+    return markdown_lines([headings, *body]) + (f"\n{note}\n" if note else "")
 
 
 def write_markdown(path: str | Path, rows: Sequence[ResultRow]) -> None:

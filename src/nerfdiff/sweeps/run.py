@@ -162,7 +162,9 @@ class Run:
 
     def _record(self, job: Job, error: Exception) -> None:
         """A row for a job whose process is gone."""
-        from nerfdiff.evaluation.measure import record_failure  # imports PyTorch, which this process may not need
+        # they import PyTorch, which this process may not need
+        from nerfdiff.evaluation.measure import record_failure
+        from nerfdiff.training.rows import append_training_row
 
         log.error("this job of the sweep ended with its process: %s", " ".join(job))
         config = self.load(self.config, self._words(job))
@@ -170,7 +172,10 @@ class Run:
             config.hydra.runtime.output_dir = str((self._folder / config.hydra.sweep.subdir).absolute())
         HydraConfig.instance().set_config(config)
         try:
-            record_failure(config, error, None, None)
+            if "strategy" in config:
+                record_failure(config, error, None, None)
+            else:  # of train.py
+                append_training_row(config, None, error)
         finally:
             HydraConfig.instance().set_config(self.config)
 

@@ -37,6 +37,7 @@ class SweepTable(Callback):
         reference, goal, paper: see `lines_of`.
         bootstrap: of the intervals.
         frontier: pictures and terminal show the lines on it alone; None has them show all lines.
+        show: whether the terminal and pictures show the lines.
         pause: seconds between two writings of the table while the sweep runs.
     """
 
@@ -49,9 +50,11 @@ class SweepTable(Callback):
         bootstrap: Bootstrap,
         frontier: Frontier | None,
         pause: float,
+        show: bool,
     ):
         self.labels, self.reference, self.goal = labels, reference, goal
         self.paper, self.bootstrap, self.frontier, self.pause = paper, bootstrap, frontier, pause
+        self.show = show
         self.sweep: DictConfig | None = None
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
@@ -113,11 +116,14 @@ class SweepTable(Callback):
     def _show(self, groups: Sequence[Group], lines: Sequence[Line], notes: Sequence[str]) -> None:
         folder = Path(self.sweep.hydra.sweep.dir)
         shown = [number for number, line in enumerate(lines) if line.frontier or self.frontier is None]
-        if shown:
+        if shown and self.show:
             console = Console(width=None if sys.stdout.isatty() else 200)
             console.print(to_rich([lines[number] for number in shown], notes))
         if not any(line.seeds for line in lines):
             raise SystemExit(f"error: no job of this sweep succeeded; {folder / 'table.md'} says why")
+        if not self.show:
+            log.info("table: %s and .csv", folder / "table.md")
+            return
         try:
             left = self._pictures(folder, [groups[number] for number in shown])
         except Exception as error:  # of whatever reads the jobs' pictures and videos

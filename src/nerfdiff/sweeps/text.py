@@ -8,7 +8,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from nerfdiff.metrics.table import METRICS
+from nerfdiff.metrics.table import METRICS, reward_note
 from nerfdiff.results.intervals import Estimate
 from nerfdiff.results.table import Column, all_columns
 from nerfdiff.results.text import csv_lines, markdown_cell, markdown_lines, one_line
@@ -44,7 +44,7 @@ def to_csv(lines: Sequence[Line]) -> str:
 def to_markdown(lines: Sequence[Line], notes: Sequence[str] = ()) -> str:
     """A row per line, what its numbers are, and `notes`."""
     headings, body = cells(lines)
-    told = [f"{markdown_cell(note)}\n" for note in notes]
+    told = [f"{markdown_cell(note)}\n" for note in filter(None, [reward_note(headings), *notes])]
     return "\n".join([markdown_lines([headings, *body]), f"{NOTE}\n", *told])
 
 
@@ -58,7 +58,9 @@ def to_rich(lines: Sequence[Line], notes: Sequence[str] = ()) -> Group:
         if heading != "error":
             table.add_row(*(Text(one_line(cell)) for cell in (heading, *values)))  # brackets are no markup here
     errors = [f"{line.name}: {line.error}" for line in lines if line.error]
-    return Group(table, *(Text(one_line(text)) for text in [*errors, NOTE, *notes]))
+    return Group(
+        table, *(Text(one_line(text)) for text in filter(None, [*errors, NOTE, reward_note(headings), *notes]))
+    )
 
 
 def cells(lines: Sequence[Line]) -> tuple[list[str], list[list[str]]]:
@@ -106,7 +108,7 @@ def _number(value: float | None, column: Column, sign: str = "") -> str | None:
 
 
 def _names(fields: Sequence[str]) -> str | None:
-    return ", ".join(column.heading.rstrip(" ↑↓") for column in all_columns() if column.field in fields) or None
+    return ", ".join(column.heading.rstrip(" ↑↓†") for column in all_columns() if column.field in fields) or None
 
 
 def _share(value: float | None) -> str | None:

@@ -32,10 +32,12 @@ from nerfdiff.inputs import LAST, find_weights
 from nerfdiff.model import settings_of
 from nerfdiff.processes import lost_process, watch
 from nerfdiff.stopping import Stopped
+from nerfdiff.stress.stress import stress_of, stressed_readers, with_stress
 from nerfdiff.training.callbacks.checkpoint import ClearCheckpointIO
 from nerfdiff.training.callbacks.record import Record
 from nerfdiff.training.memory import WEIGHTS_ADAM_EMA, is_tight, within_memory
 from nerfdiff.training.module import NerfDiffModule
+from nerfdiff.training.rows import append_training_row
 from nerfdiff.utils.config import auto_precision, plain
 from nerfdiff.utils.errors import CheckpointError, ConfigError, ProcessLost, TrainingDiverged
 from nerfdiff.utils.files import held, remove_leftovers
@@ -54,7 +56,8 @@ def train(cfg: DictConfig) -> dict[str, float]:
         the last logged metrics.
 
     Raises:
-        UserError: bad data, config, checkpoint, or a run that diverged; the message says what to do.
+        UserError: bad data, config, checkpoint, or a run that diverged; the message says what to do. Where there is a
+            `cfg.results`, a row tells it too.
     """
     watch()
     # Seeds the initial weights, and dropout where a model has it. All other randomness is a function of cfg.seed and
@@ -62,9 +65,18 @@ def train(cfg: DictConfig) -> dict[str, float]:
     seed_everything(cfg.seed, verbose=False)
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
-    trainer = build_trainer(cfg)
-    with held(Path(cfg.paths.output_dir)) if trainer.is_global_zero else nullcontext():
-        return _train(cfg, trainer)
+    cfg, trainer = with_stress(cfg, "train"), None
+    try:
+        trainer = build_trainer(cfg)
+        with held(Path(cfg.paths.output_dir)) if trainer.is_global_zero else nullcontext():
+            found = _train(cfg, trainer)
+    except Exception as error:
+        if cfg.results is not None and not isinstance(error, Stopped):
+            append_training_row(cfg, trainer, error)
+        raise
+    if cfg.results is not None and trainer.is_global_zero:
+        append_training_row(cfg, trainer, None)
+    return found
 
 
 def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
@@ -74,6 +86,8 @@ def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
             remove_leftovers(folder)
     model_config = settings_of(cfg)
     datamodule = instantiate(cfg.data)
+    if (stress := stress_of(cfg)) is not None:
+        datamodule.make_reader = stressed_readers(datamodule.make_reader, stress, cfg.data.train_split)
     last = _checkpoint_to_resume(output_dir, cfg, model_config, datamodule)
     model_config = _within_memory(model_config, trainer, datamodule)
     module = NerfDiffModule(

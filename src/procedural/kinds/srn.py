@@ -32,7 +32,7 @@ from procedural.kinds.kind import SceneJob, ascending, check_splits, check_style
 from procedural.mesh import Model
 from procedural.mitsuba_model import ModelWorld
 from procedural.mitsuba_renderer import Film, MitsubaRenderer
-from procedural.poses import FOCAL_PER_PIXEL, random_sphere
+from procedural.poses import FOCAL_PER_PIXEL, random_sphere, rings
 from procedural.root_folder import half_written
 
 SPLITS = ("train", "val", "test")
@@ -42,7 +42,7 @@ STYLES = {"cars": tuple(CAR_STYLES), "chairs": tuple(CHAIR_STYLES)}
 
 @dataclass(frozen=True)
 class SRNScenes:
-    """One object per scene: random cameras in training, SRN's spiral otherwise."""
+    """One object per scene: random cameras in training, SRN's spiral otherwise, or rings of some elevations."""
 
     category: str
     film: Film
@@ -50,6 +50,7 @@ class SRNScenes:
     radius: int | float
     elevation: tuple[int | float, int | float]
     styles: Mapping[str, int | float]
+    rings: tuple[int | float, ...] = ()
 
     @classmethod
     def from_config(cls, cfg: Mapping[str, Any]) -> "SRNScenes":
@@ -62,19 +63,30 @@ class SRNScenes:
         check_styles(scenes["styles"], STYLES[scenes["category"]], scenes["category"])
         check_splits(cfg["splits"], SPLITS, scenes["category"])
         for split, wanted in cfg["splits"].items():
-            if split != "train" and wanted["views"] > SPIRAL_VIEWS:
+            if split != "train" and not scenes["rings"] and wanted["views"] > SPIRAL_VIEWS:
                 raise ConfigError(f"splits.{split}.views={wanted['views']}: the spiral has {SPIRAL_VIEWS} views")
         if not scenes["radius"] > 0.5:
             raise ConfigError(f"scenes.radius={scenes['radius']}: expected more than 0.5, outside the object")
+        if any(not -90 < elevation < 90 for elevation in scenes["rings"]):
+            raise ConfigError(f"scenes.rings={scenes['rings']}: expected degrees between -90 and 90")
         low, high = ascending("scenes.elevation", scenes["elevation"], -90, 90)
         if low == high:
             raise ConfigError(f"scenes.elevation=[{low}, {high}]: expected two different degrees")
         fov = float(np.rad2deg(2 * np.arctan(0.5 / FOCAL_PER_PIXEL)))
         film = Film(cfg["resolution"], cfg["resolution"], fov, cfg["samples_per_pixel"])
-        return cls(scenes["category"], film, cfg["seed"], scenes["radius"], (low, high), scenes["styles"])
+        return cls(
+            scenes["category"],
+            film,
+            cfg["seed"],
+            scenes["radius"],
+            (low, high),
+            scenes["styles"],
+            tuple(scenes["rings"]),
+        )
 
     def parameters(self) -> dict[str, Any]:
-        return {"radius": self.radius, "elevation": list(self.elevation), "styles": dict(self.styles)}
+        found = {"radius": self.radius, "elevation": list(self.elevation), "styles": dict(self.styles)}
+        return found | ({"rings": list(self.rings)} if self.rings else {})
 
     def split_folder(self, split: str) -> str:
         if (self.category, split) == ("chairs", "train"):
@@ -103,7 +115,7 @@ class SRNScenes:
         if job.split == "train":
             rng = stream(self.seed, self.category, job, "cameras")
             return random_sphere(self.radius, job.views, rng, self.elevation)
-        return srn_spiral(self.radius, job.views)
+        return rings(self.radius, job.views, self.rings) if self.rings else srn_spiral(self.radius, job.views)
 
     def make(self, job: SceneJob, renderer: MitsubaRenderer) -> None:
         model, c2w = self.model(job), self.poses(job)

@@ -96,6 +96,9 @@ $("counts").textContent = data.counts;
 $("how").textContent = data.how;
 $("unread").hidden = !data.unread.length;
 $("unread").replaceChildren(...data.unread.map((line) => element("li", {}, line)));
+drawStability();
+$("rewards").hidden = !data.rewards;
+$("rewards").textContent = data.rewards ?? "";
 $("empty").hidden = !data.empty;
 $("empty").textContent = data.empty ?? "";
 if (data.panels.length) {

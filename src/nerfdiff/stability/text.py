@@ -1,0 +1,157 @@
+"""Verdicts as Markdown."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from omegaconf import DictConfig
+
+from nerfdiff.results.row import ResultRow
+from nerfdiff.results.text import markdown_lines, one_line
+from nerfdiff.stability.breaking import Breaking
+from nerfdiff.stability.study import Study, Verdict
+
+RULES = (
+    "A strategy is broken at a severity where (a) a tenth of its scenes fall back or have no finite result, (b) it is "
+    "3 dB under its own clean result or under the better of the two baselines, (c) it is 0.5 dB worse than `none` at "
+    "the same severity, or (d) its Fréchet distance is twice the clean one. Intervals are bootstrap intervals over "
+    "scenes and seeds. A silent failure is a scene that (b) or (c) holds for by itself, with status ok and verdict ok."
+)
+
+
+def severity_text(stress: DictConfig, severity: float | None) -> str:
+    """A severity with its unit, or in the words of its kind."""
+    if severity is None:
+        return "–"
+    words = {float(key): word for key, word in stress.words.items()}
+    if severity in words:
+        return words[severity]
+    unit = stress.unit
+    if unit.startswith("×"):
+        return f"×{severity:g}{unit[1:]}"
+    return f"{severity:g}{'' if unit == '°' else ' ' if unit else ''}{unit}".strip()
+
+
+def breaking_text(stress: DictConfig, breaking: Breaking) -> str:
+    """A breaking point with its interval and the rules that hold; of an end beyond what was tested, a >."""
+    beyond = f"> {severity_text(stress, breaking.furthest)}" if stress.ordered else "none"
+    if breaking.severity is None:
+        if breaking.interval[0] is None:
+            return beyond
+        return f"{beyond} [{severity_text(stress, breaking.interval[0])}, –]"
+    text = severity_text(stress, breaking.severity)
+    low, high = (severity_text(stress, end) if end is not None else "–" for end in breaking.interval)
+    return f"{text} [{low}, {high}] ({breaking.rules})"
+
+
+def to_markdown(found: Sequence[Study], waiting: Sequence[str] = (), left_out: Sequence[str] = ()) -> str:
+    """Breaking points by axis and strategy, then areas and means.
+
+    Args:
+        waiting: jobs that were not run.
+        left_out: what the sweep leaves out, and why.
+    """
+    parts = ["# Stability\n"]
+    for study in found:
+        strategies = list(dict.fromkeys(verdict.strategy for verdict in study.verdicts))
+        by = {(verdict.axis, verdict.strategy): verdict for verdict in study.verdicts}
+        parts.append(f"{one_line(' '.join(study.settings))}\n")
+        parts.append(f"**Silent failures: {study.silent} of {study.broken} broken scenes.**\n")
+        parts.append(f"{RULES}\n")
+        clean = [f"{study.clean[s]:.2f}" if s in study.clean else "–" for s in strategies]
+        rows = [["axis", *strategies], ["clean PSNR, dB", *clean]]
+        for axis in dict.fromkeys(verdict.axis for verdict in study.verdicts):
+            stress = study.axes[axis]
+            cells = [_cell(stress, by.get((axis, strategy))) for strategy in strategies]
+            rows.append([stress.name, *cells])
+        parts += ["## Breaking points\n", markdown_lines(rows), "\n## Loss against clean, divided by that of `none`\n"]
+        rows = [["axis", *strategies]]
+        for axis in dict.fromkeys(verdict.axis for verdict in study.verdicts):
+            areas = [by[axis, s].area if (axis, s) in by else None for s in strategies]
+            if any(value is not None for value in areas):
+                rows.append([study.axes[axis].name, *("–" if a is None else f"{a:.2f}" for a in areas)])
+        parts += [markdown_lines(rows), "\n## Every severity\n", markdown_lines(_lines(study))]
+    if waiting:
+        parts.append(f"\nNot run: {len(waiting)} jobs, the first {waiting[0]}; the same command goes on.\n")
+    parts += [f"\nLeft out: {line}.\n" for line in left_out]
+    return "\n".join(parts)
+
+
+def _cell(stress: DictConfig, verdict: Verdict | None) -> str:
+    if verdict is None:
+        return "–"
+    return " / ".join(breaking_text(stress, breaking) for breaking in verdict.breaking)
+
+
+def _lines(study: Study) -> list[list[str]]:
+    """A line per axis, strategy and severity: the mean with and without the scenes that fell back."""
+    headings = ["axis", "strategy", "severity", "PSNR", "without fallbacks", "loss, dB", "failed", "suspect", "broken"]
+    rows = [[*headings, "silent", "first broken scene"]]
+    for verdict in study.verdicts:
+        stress = study.axes[verdict.axis]
+        for point in verdict.points:
+            loss = point.loss
+            ends = "" if loss is None or loss.low is None else f" [{loss.low:.2f}, {loss.high:.2f}]"
+            first = min((scene for _, scene in point.broken_scenes), default="–")
+            rows.append(
+                [
+                    *(stress.name, verdict.strategy, severity_text(stress, point.severity)),
+                    _number(point.psnr.mean),
+                    _number(point.without_fallbacks),
+                    "–" if loss is None else f"{loss.mean:.2f}{ends}",
+                    *(f"{point.failed} of {point.total}", str(point.suspect), point.broken or "–"),
+                    *(str(len(point.silent)), first),
+                ]
+            )
+    return rows
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None or not math.isfinite(value) else f"{value:.2f}"
+
+
+def training_markdown(rows: Sequence[ResultRow], axes: Mapping[str, DictConfig]) -> str:
+    """A line per stress of training and severity: means over seeds, and how many runs did not end."""
+    groups: dict[tuple[str, float | None], list[ResultRow]] = {}
+    for row in rows:
+        groups.setdefault((row.stress or "none", row.severity), []).append(row)
+    table = [
+        ["stress", "severity", "held-out PSNR, dB", "against clean", "spikes", "steps without a gradient"]
+        + ["99 % of gradient norms", "recovered", "runs that ended"]
+    ]
+    clean = _mean([row.psnr for row in groups.get(("none", None), ())])
+    for (axis, severity), own in sorted(
+        groups.items(), key=lambda item: (item[0][0] != "none", item[0][0], item[0][1] or 0)
+    ):
+        psnr = _mean([row.psnr for row in own])
+        upset = [row for row in own if row.loss_spikes or row.nonfinite_grad_steps]
+        recovered = f"{sum(row.status == 'ok' for row in upset)} of {len(upset)}" if upset else "–"
+        stress = axes.get(axis)
+        table.append(
+            [
+                stress.name if stress is not None else axis,
+                severity_text(stress, severity) if stress is not None else "–",
+                _number(psnr),
+                "–" if psnr is None or clean is None else f"{psnr - clean:+.2f}",
+                *(
+                    _number(_mean([getattr(row, key) for row in own]))
+                    for key in ("loss_spikes", "nonfinite_grad_steps")
+                ),
+                _number(_mean([row.grad_norm_p99 for row in own])),
+                recovered,
+                f"{sum(row.status == 'ok' for row in own)} of {len(own)}",
+            ]
+        )
+    said = (
+        "Means over seeds of runs that ended. A run has recovered if it had spikes or steps without a gradient, and "
+        "ended with its losses finite."
+    )
+    return f"# Stability of training\n\n{said}\n\n{markdown_lines(table)}"
+
+
+COUNTS = ("loss_spikes", "nonfinite_grad_steps", "grad_norm_p99")
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None and math.isfinite(value)]
+    return float(np.mean(known)) if known else None

@@ -1,0 +1,52 @@
+"""A training run as a row of results: how it ended, how calm it was, and its held-out error."""
+
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from lightning import Trainer
+from omegaconf import DictConfig
+
+from nerfdiff.results.environment import environment
+from nerfdiff.results.row import ResultRow, append_row
+from nerfdiff.stress.stress import stress_of
+from nerfdiff.training.callbacks.nonfinite import NonFiniteGuard
+from nerfdiff.utils.errors import TrainingDiverged, is_out_of_memory
+
+
+def append_training_row(cfg: DictConfig, trainer: Trainer | None, error: Exception | None) -> ResultRow:
+    """Append the row of a run to `cfg.results`; `psnr` is the last held-out one of renderings.
+
+    Args:
+        cfg: with the settings of its stress.
+        trainer: None where the run failed before it had one.
+        error: that ended it.
+    """
+    guard = next((c for c in trainer.callbacks if isinstance(c, NonFiniteGuard)), None) if trainer is not None else None
+    stability: dict[str, Any] = guard.stability.summary() if guard is not None else {}
+    held_out = trainer.callback_metrics.get("val/psnr") if trainer is not None else None
+    stress = stress_of(cfg)
+    status = "ok"
+    if error is not None:
+        status = "diverged" if isinstance(error, TrainingDiverged) else "oom" if is_out_of_memory(error) else "error"
+    hydra = HydraConfig.get() if HydraConfig.initialized() else None
+    device = trainer.strategy.root_device if trainer is not None else "cpu"
+    row = ResultRow(
+        run_id=cfg.run_name,
+        status=status,
+        error=None if error is None else str(error),
+        strategy="training",
+        model=cfg.model.name,
+        field=cfg.model.field.name,
+        dataset=f"{cfg.data.name}/{cfg.data.val_split}",
+        seed=cfg.seed,
+        overrides=None if hydra is None else list(hydra.overrides.task),
+        psnr=None if held_out is None else float(held_out),
+        stress=stress and stress.axis,
+        severity=None if stress is None else float(stress.severity),
+        neutral=None if stress is None or stress.neutral is None else float(stress.neutral),
+        **environment(device, cfg.trainer.precision),
+        **stability,
+    )
+    append_row(Path(cfg.results), row)
+    return row

@@ -81,8 +81,9 @@ def test_chosen_views_are_denoised_as_if_there_were_no_others(follows):
 @pytest.mark.parametrize(("fit_source", "coarse"), [(False, "every_step"), (True, "refresh")])
 def test_what_is_dropped_is_neither_denoised_rendered_nor_fitted(fit_source, coarse):
     of, options = net(), {"coarse": coarse, "fit_source": fit_source, "inner_steps": 1}
-    every = distillation(guided(condition="current"), **options).distil(of, [scene()], 0)
-    module = distillation(guided(condition="current"), views_last=1, **options).distil(of, [scene()], 0)
+    teacher = guided(condition="current", at="everything")
+    every = distillation(teacher, **options).distil(of, [scene()], 0)
+    module = distillation(teacher, views_last=1, **options).distil(of, [scene()], 0)
     assert every.views[0].denoiser_calls == 4 * 3 and module.views[0].denoiser_calls == 3 + 2 + 2 + 1
     view = 16 * 16 * of.renderer.samples_per_ray
     # four steps, and the two renderings at the end
@@ -196,7 +197,7 @@ def test_autoguidance_leads_away_from_what_the_snapshot_makes(tmp_path):
 
 
 TEACHERS = {
-    "ngd": lambda own: lambda v: NGDTeacher(v, 2, sampling(), Guidance("snr", 0.3, "current"), "current", own),
+    "ngd": lambda own: lambda v: NGDTeacher(v, 2, sampling(), Guidance("snr", 0.3, "last"), "current", "fit", own),
     "direct": lambda own: lambda v: DirectTeacher(v, 2, 2, sampling(), own),
 }
 

@@ -94,8 +94,8 @@ def test_the_mask_is_shown_and_can_be_given_back(tmp_path):
 
 
 def test_a_networks_weights_are_taken_where_they_are_and_never_fetched(tmp_path, monkeypatch):
-    photograph(*wagon(), tmp_path / "car.jpg", (60, 80), (0.5, 0.5), 0.75, 0)
-    square = np.zeros((60, 80), np.uint8)
+    photograph(*wagon(), tmp_path / "car.jpg", (300, 400), (0.5, 0.5), 0.75, 0)
+    square = np.zeros((300, 400), np.uint8)
     square[20:40, 30:50] = 255
     asked = []
     rembg = SimpleNamespace(

@@ -132,7 +132,9 @@ def test_jobs_that_take_their_process_along_are_rows_and_the_others_of_their_bat
     monkeypatch.setattr(pytest.MonkeyPatch, "instance", lambda: Instance(), raising=False)
     launcher = Here(tmp_path, dies)
     run = sweep(launcher)
-    run.load = lambda config, words: OmegaConf.create({"hydra": {"runtime": {}, "sweep": {"subdir": words[-1]}}})
+    run.load = lambda config, words: OmegaConf.create(
+        {"strategy": {}, "hydra": {"runtime": {}, "sweep": {"subdir": words[-1]}}}
+    )
     run()
     rows = read_rows(tmp_path / "results.jsonl")
     assert Counter(row.status for row in rows) == {"ok": 2 * N - len(deadly), "error": len(deadly)}

@@ -118,7 +118,7 @@ def test_what_is_timed_in_part_is_said(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("budget", "steps", "asked"), [("minutes", 16, (10, 16)), ("fast", 16, (8, 8))])
 def test_steps_that_are_left_out_count_as_no_work(budget, steps, asked):
     """w = 1 for t of 0.681 and more; of extrapolated steps none is left out."""
-    arguments = SimpleNamespace(strategy="ngd", budget=budget, steps=None)
+    arguments = SimpleNamespace(strategy="ngd_equation", budget=budget, steps=None)
     assert ngd_object.Plan.of(arguments, ()).asked(steps) == asked
     arguments.steps = 4
     part = ngd_object.Plan.of(arguments, ())

@@ -109,7 +109,7 @@ def test_k_is_the_number_of_views_that_fields_were_fitted_to(data, run, tmp_path
         settings = "prior=abo_views", f"budget.views={asked}", f"data.eval_stride={stride}", *small
         row = distill(config(data, run, tmp_path, *settings))
         assert (row.K, row.prior) == (used, "SceneCameras")
-        assert row.denoiser_calls == 2 * used  # of each scene; at t = 1, the first of two steps, no one asks
+        assert row.denoiser_calls == 2 * 2 * used  # two steps, two scenes
         assert (f"{used} virtual views instead of the {asked}" in caplog.text) == (used < asked)
     none = distill(config(data, run, tmp_path, "strategy=none", *small))
     assert none.K is none.prior is None
@@ -124,7 +124,7 @@ def test_scenes_with_different_numbers_of_views_are_told(data, run, tmp_path, mo
 
     cfg = config(data, run, tmp_path, "sheet.scenes=0", "orbit.frames=0")
     monkeypatch.setattr(
-        "nerfdiff.evaluation.distill._strategy",
+        "nerfdiff.evaluation.distill.build_strategy",
         lambda cfg: dataclasses.replace(instantiate(cfg.strategy, _convert_="all"), prior=Odd()),
     )
     row = distill(cfg)

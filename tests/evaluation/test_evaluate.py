@@ -204,7 +204,7 @@ def test_another_resolution_than_in_training_is_named(data, run, tmp_path):
     ("setting", "word"),
     [
         ("device=cuda:7", "device=auto"),
-        ("precision=16-mixed", "bf16-mixed"),
+        ("precision=16", "bf16-mixed"),
         ("kernel_precision=fp8", "kernel_precision='fp8': choose auto, ieee"),
     ],
 )

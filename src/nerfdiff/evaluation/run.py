@@ -296,8 +296,8 @@ def _run(
     in_pixels = channels_last(cfg.channels_last, device, cfg.compile != "none")
     if in_pixels:
         model.to(memory_format=torch.channels_last)
-    if precision != "32-true":
-        cast_products(model.denoiser, torch.bfloat16)
+    if (halves := PRECISIONS[precision]) is not None:
+        cast_products(model.denoiser, halves)
     compile_unets(model, cfg.compile, cfg.paths.compiled_dir)
     spent_on = [hardware(device), cfg.threads, cfg.scenes_at_once, model.renderer.chunk, in_pixels]
     settings = RunSettings.of(cfg)

@@ -184,7 +184,9 @@ def read_scenes(run: Run) -> dict[str, Outcome]:
         with open(path, newline="", encoding="utf-8") as file:
             return {
                 line["scene"]: Outcome(
-                    float(line["psnr"]) if line.get("psnr") else math.nan, line["status"], line.get("verdict") or None
+                    float(line["psnr"]) if line.get("psnr") else math.nan,
+                    line["status"] or "error",
+                    line.get("verdict") or None,
                 )
                 for line in csv.DictReader(file)
             }
@@ -199,7 +201,7 @@ def _outcomes(runs: Sequence[Run], scenes: Sequence[str]) -> Outcomes:
     for run in runs:
         own = read_scenes(run)
         if not own:
-            status = run.row.status if run.row.status != "ok" else "error"
+            status = run.row.status if run.row.status not in ("ok", None) else "error"
             own = {scene: Outcome(math.nan, status) for scene in scenes or ("?",)}
         found |= {(run.row.seed or 0, scene): outcome for scene, outcome in own.items()}
     return found

@@ -1,4 +1,4 @@
-"""What metrics say of failures, and what the judge knows: `python src/calibrate.py part=controls data.root=…`."""
+"""Controls of the metrics, and calibration of the judge: `python src/calibrate.py part=controls data.root=…`."""
 
 from nerfdiff.commands.calibrate import main
 

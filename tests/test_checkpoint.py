@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from model_fixtures import config
-from nerfdiff.checkpoint import LoadedModel, export_model, load_model
+from nerfdiff.checkpoint import load_model
+from nerfdiff.exported_model import LoadedModel, export_model
 from nerfdiff.model import NerfDiff
 from nerfdiff.utils.errors import CheckpointError, ConfigError
 

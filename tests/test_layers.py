@@ -12,7 +12,7 @@ SRC = Path(__file__).parents[1] / "src"
 LAYERS = (
     "utils", "stopping", "processes", "noise", "quoting", "limits", "inputs", "cli",
     "cameras", "poses", "trajectories", "data",
-    "diffusion", "field", "render", "model", "averages", "checkpoint", "compilation",
+    "diffusion", "field", "render", "model", "averages", "exported_model", "checkpoint", "compilation",
     "fit", "metrics", "results", "distill", "stress", "stability", "training",
     "evaluation", "exports", "inspection", "chart", "sweeps", "demo", "api", "pictures", "commands",
 )  # fmt: skip

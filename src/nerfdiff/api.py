@@ -21,7 +21,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from PIL import Image
 
-from nerfdiff.checkpoint import LoadedModel, load_model
+from nerfdiff.checkpoint import load_model
 from nerfdiff.cli import load_config
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.cutout import Mask
@@ -29,6 +29,7 @@ from nerfdiff.distill.priors import all_cameras
 from nerfdiff.evaluation.distill import build_strategy
 from nerfdiff.evaluation.progress import SceneProgress
 from nerfdiff.evaluation.run import autocast, choose_device, picture_scene
+from nerfdiff.exported_model import LoadedModel
 from nerfdiff.exports.export import FORMATS, FieldExport
 from nerfdiff.exports.views import render_rgba, to_image
 from nerfdiff.fit.saved_field import SavedField, load_field, save_field

@@ -4,66 +4,28 @@ import logging
 import pickle
 import re
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import torch
-import yaml
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 
 from nerfdiff.averages import average_of
+from nerfdiff.exported_model import DTYPES, LoadedModel, Read, are_phases, export_model, is_size, read_export
 from nerfdiff.field.kinds import TRIPLANE
-from nerfdiff.inputs import LAST, PREVIOUS, WEIGHTS, find_weights
+from nerfdiff.inputs import LAST, PREVIOUS, find_weights
 from nerfdiff.model import NerfDiff, build_on_meta
 from nerfdiff.utils.errors import CheckpointError, ConfigError
-from nerfdiff.utils.files import atomic, write_text
-from nerfdiff.utils.hashes import sha256_file, sha256_values
 
-CONFIG, SNAPSHOTS = "model.yaml", "snapshots"
+SNAPSHOTS = "snapshots"
 DIVERGED, DAMAGED = "diverged.ckpt", "damaged.ckpt"
-DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 _PREFIX = "model."
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class LoadedModel:
-    """A model ready to use, and where it came from.
-
-    Args:
-        model: on the CPU, in evaluation mode.
-        path: the file its weights were read from.
-        weights: `ema` or `raw`.
-        config: arguments of `NerfDiff`.
-        image_size: (height, width) of the images it was trained on, if known.
-        stability: of its training, under the names of `ResultRow`, where that was recorded.
-        trained_on: one entry for each training that led to it (`NerfDiffModule.trained_on`), where that was recorded.
-    """
-
-    model: NerfDiff
-    path: Path
-    weights: str
-    config: Mapping
-    image_size: list[int] | None
-    stability: Mapping[str, float | int | None]
-    trained_on: Sequence[Mapping[str, Any]] = ()
-
-    def describe(self) -> str:
-        """One line on what the model has seen."""
-        phases = [
-            f"{phase['images']:,} images for the {phase['part']} of {phase['scenes']} scenes of {phase['dataset']} "
-            f"({phase['about']})"
-            for phase in self.trained_on
-        ]
-        size = f", {self.image_size[0]}x{self.image_size[1]} pixels" if self.image_size else ""
-        return f"{self.path}{size}: trained on {', then '.join(phases) or 'what was not recorded'}"
 
 
 def load_model(
@@ -85,7 +47,7 @@ def load_model(
     path = find_weights(ckpt, assets)
     if Path(ckpt).is_dir() and path.name in (LAST, PREVIOUS):
         path = last_checkpoint(ckpt)  # the last one that can be read
-    read = _read_export if path.suffix == ".safetensors" else _read_ckpt
+    read = read_export if path.suffix == ".safetensors" else _read_ckpt
     config, state, about = read(path, weights)
     recorded = about.get("image_size"), about.get("stability") or {}, about.get("trained_on") or ()
     return LoadedModel(_build(config, renderer, state, path), path, weights, config, *recorded)
@@ -155,27 +117,14 @@ def _unexpected(checkpoint: Any) -> str | None:
         ("state_dict", True, tensors, "tensors by name"),
         ("current_model_state", False, tensors, "tensors by name"),
         ("global_step", True, lambda value: isinstance(value, int) and value >= 0, "a number of steps"),
-        ("image_size", False, lambda value: value is None or _is_size(value), "[height, width]"),
+        ("image_size", False, lambda value: value is None or is_size(value), "[height, width]"),
         ("stability", False, lambda value: isinstance(value, Mapping), "numbers by name"),
         ("SceneDataModule", False, _is_text_by_name, "what it was trained on"),
-        ("trained_on", False, _are_phases, "what it was trained on"),
+        ("trained_on", False, are_phases, "what it was trained on"),
     ):
         if (needed or key in checkpoint) and not possible(checkpoint.get(key)):
             return f"expected {expected} as its {key}, found a {type(checkpoint.get(key)).__name__}"
     return None
-
-
-def _are_phases(value: Any) -> bool:
-    """Return true for a list of `NerfDiffModule.trained_on`'s entries."""
-    kinds = {"part": str, "images": int, "scenes": int, "dataset": str, "about": str}
-    return isinstance(value, list) and all(
-        isinstance(phase, Mapping) and all(isinstance(phase.get(key), kind) for key, kind in kinds.items())
-        for phase in value
-    )
-
-
-def _is_size(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(type(side) is int and side > 0 for side in value)
 
 
 def _is_text_by_name(value: Any) -> bool:
@@ -197,51 +146,6 @@ def _instead(path: Path) -> str:
         f"{best} beside it can be read, of step {steps[best]}: say ckpt={best}; to train on from there, copy it to "
         f"{path.parent / LAST}"
     )
-
-
-def export_model(loaded: LoadedModel, folder: str | Path, dtype: torch.dtype, shared: str | Path | None = None) -> Path:
-    """Write weights (safetensors) and the settings (YAML) that rebuild the model.
-
-    Args:
-        dtype: of the stored weights.
-        shared: an exported model's folder beside this one. Weights that are the same there are not written again, and
-            are read from there; it has to stay beside this one.
-
-    Raises:
-        CheckpointError: weights are not finite, or beyond what `dtype` holds; nothing is written.
-        ConfigError: `shared` is elsewhere, or shares nothing.
-    """
-    folder = Path(folder)
-    state = {name: value.to("cpu", dtype).contiguous() for name, value in loaded.model.state_dict().items()}
-    for name, value in loaded.model.state_dict().items():
-        if not value.isfinite().all():
-            raise CheckpointError(
-                f"{loaded.path} holds weights that are not finite ({name}), and is not exported: its training "
-                "diverged. Give an earlier checkpoint"
-            )
-        if not state[name].isfinite().all():
-            raise CheckpointError(
-                f"{loaded.path} holds weights of {value.abs().max():.3g} ({name}), and {dtype} only holds "
-                f"{torch.finfo(dtype).max:.3g}: choose dtype=bfloat16 or float32"
-            )
-    settings = {"weights": loaded.weights, "image_size": loaded.image_size, "model": dict(loaded.config)}
-    if shared is not None:
-        other = Path(shared) / WEIGHTS
-        if folder.absolute().parent != other.absolute().parents[1]:
-            raise ConfigError(f"shared={shared}: only a model in the folder that {folder} is in can be shared")
-        theirs = _load_weights(other)
-        own = {n: v for n, v in state.items() if n not in theirs or not torch.equal(v, theirs[n].to(v.dtype))}
-        if len(own) == len(state):
-            raise ConfigError(f"shared={shared} has none of the weights of {loaded.path}")
-        state = own
-        settings["shared"] = {"folder": Path(shared).absolute().name, "sha256": sha256_file(other)}
-    with atomic(folder / WEIGHTS) as temporary:
-        save_file(state, temporary)
-    settings |= {"stability": dict(loaded.stability)} if loaded.stability else {}
-    settings |= {"trained_on": [dict(phase) for phase in loaded.trained_on]} if loaded.trained_on else {}
-    settings["sha256"] = _digest(folder / WEIGHTS, settings)
-    write_text(folder / CONFIG, yaml.safe_dump(settings, sort_keys=False))
-    return folder / WEIGHTS
 
 
 def export(
@@ -318,10 +222,6 @@ def check_resumable(path: str | Path, model_config: Mapping, accumulate: int) ->
         )
 
 
-Read = tuple[Mapping, dict[str, torch.Tensor], Mapping[str, Any]]
-"""Settings and weights of a model, and what else is recorded of it."""
-
-
 def _read_ckpt(path: Path, weights: str) -> Read:
     checkpoint = read_checkpoint(path)
     averaged = "current_model_state" in checkpoint
@@ -330,59 +230,6 @@ def _read_ckpt(path: Path, weights: str) -> Read:
     state = checkpoint["current_model_state" if weights == "raw" and averaged else "state_dict"]
     state = {name.removeprefix(_PREFIX): value for name, value in state.items() if name.startswith(_PREFIX)}
     return checkpoint["hyper_parameters"]["model"], state, checkpoint
-
-
-def _read_export(path: Path, weights: str) -> Read:
-    try:
-        settings = yaml.safe_load(path.with_name(CONFIG).read_text())
-        stored, config = settings["weights"], settings["model"]
-        image_size, digest = settings["image_size"], settings.pop("sha256", None)
-        if not isinstance(config, Mapping) or not isinstance(settings.get("stability", {}), Mapping):
-            raise TypeError("expected settings by name as its model")
-        if not _are_phases(settings.get("trained_on", [])):
-            raise TypeError("expected what it was trained on as its trained_on")
-        if image_size is not None and not _is_size(image_size):
-            raise TypeError(f"expected [height, width] as its image_size, found {image_size!r}")
-    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise CheckpointError(
-            f"{path.with_name(CONFIG)} cannot be read ({error!r}); it holds the sizes that {path.name} was trained with"
-        ) from error
-    if weights != stored:
-        raise CheckpointError(f"{path} holds {stored} weights only: use weights={stored}")
-    state = _load_weights(path)
-    if digest is not None and digest != _digest(path, settings):  # exports from before have none
-        raise CheckpointError(
-            f"{path} and {path.with_name(CONFIG)} are not as they were written together (their SHA-256 is another): "
-            "one of the two was damaged, edited or exchanged. Export or copy both anew"
-        )
-    if shared := settings.get("shared"):
-        state = _shared_weights(path, shared) | state
-    return config, state, settings
-
-
-def _load_weights(path: Path) -> dict[str, torch.Tensor]:
-    try:
-        return load_file(path)
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path} is not a readable safetensors file ({error})") from error
-
-
-def _shared_weights(path: Path, shared: Any) -> dict[str, torch.Tensor]:
-    """Return the weights of the model beside this one that it was exported with."""
-    kinds = {"folder": str, "sha256": str}
-    if not isinstance(shared, Mapping) or not all(isinstance(shared.get(key), kind) for key, kind in kinds.items()):
-        raise CheckpointError(f"{path.with_name(CONFIG)}: expected a folder and its sha256 as its shared")
-    other = path.parents[1] / Path(shared["folder"]).name / WEIGHTS
-    if not other.is_file() or sha256_file(other) != shared["sha256"]:
-        raise CheckpointError(
-            f"{path} needs the weights of {other}, with which it was exported, and these "
-            f"{'are others' if other.is_file() else 'are not there'}: copy both folders together"
-        )
-    return _load_weights(other)
-
-
-def _digest(weights: Path, settings: Mapping) -> str:
-    return sha256_values([sha256_file(weights), settings])
 
 
 def _build(config: Mapping, renderer: Mapping, state: dict[str, torch.Tensor], path: Path) -> NerfDiff:

@@ -9,7 +9,6 @@ from test_ngd_module import distillation, guided, prior, sampling, scene
 
 from model_fixtures import config, model
 from nerfdiff.averages import PowerAverages
-from nerfdiff.checkpoint import LoadedModel, export_model
 from nerfdiff.diffusion.deep_features import DeepReuse
 from nerfdiff.distill.autoguidance import Autoguidance
 from nerfdiff.distill.cdm import CDMSampling
@@ -17,6 +16,7 @@ from nerfdiff.distill.direct import DirectTeacher
 from nerfdiff.distill.ngd import Guidance, NGDTeacher
 from nerfdiff.distill.sds import SDSTeacher
 from nerfdiff.distill.virtual_views import VirtualViews, farthest_first
+from nerfdiff.exported_model import LoadedModel, export_model
 from nerfdiff.fit.inner_steps import InnerSteps
 from nerfdiff.utils.errors import CheckpointError, ConfigError
 

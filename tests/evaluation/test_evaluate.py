@@ -13,19 +13,7 @@ from nerfdiff.evaluation.evaluate import evaluate
 from nerfdiff.metrics.predictions import NonFinitePrediction
 from nerfdiff.results.row import read_rows
 from nerfdiff.utils.errors import CheckpointError, ConfigError, DataError
-from training_fixtures import evaluation_overrides, train_to_evaluate, write_dataset
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return write_dataset(tmp_path_factory.mktemp("data"), scenes=2)
-
-
-@pytest.fixture(scope="module")
-def run(data, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("run")
-    train_to_evaluate(data, folder)
-    return folder
+from training_fixtures import evaluation_overrides
 
 
 def config(data, run, out, *more):
@@ -47,6 +35,7 @@ def test_an_evaluation_leaves_rows_scores_and_pictures(data, run, tmp_path, stra
     assert [row.strategy for row in rows] == [name, "copy_input", "mean_image"]
     assert [row.strategy for row in read_rows(tmp_path / "results.jsonl")] == [row.strategy for row in rows]
     assert rows[1].scene_s is rows[1].model is rows[1].backend is rows[1].grad_norm_p99 is None
+    assert rows[0].verdict is not None and rows[1].verdict is rows[2].verdict is None  # no model made baselines
     for row in rows:
         assert row.status == "ok" and row.n_scenes == 2 and row.n_views == 2 * 4
         assert 0 < row.psnr < 60 and row.ssim_impl == "skimage-uniform7" and row.st_lpips_vgg > 0

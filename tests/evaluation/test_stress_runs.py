@@ -12,24 +12,12 @@ from nerfdiff.evaluation.evaluate import evaluate
 from nerfdiff.results.row import read_rows
 from nerfdiff.stability.familiar import Familiar
 from nerfdiff.utils.errors import ConfigError
-from training_fixtures import evaluation_overrides, run_training, train_to_evaluate, write_dataset
+from training_fixtures import evaluation_overrides, run_training
 
 SMALL = (
     "budget=stress", "budget.steps=2", "budget.sampler_steps=2", "budget.inner_steps=1", "budget.rays=32",
     "budget.views=2", "sheet.scenes=0", "orbit.frames=0", "metrics.st_lpips=false", "dashboard=null",
 )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return write_dataset(tmp_path_factory.mktemp("data"), scenes=2)
-
-
-@pytest.fixture(scope="module")
-def run(data, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("run")
-    train_to_evaluate(data, folder)
-    return folder
 
 
 def config(data, run, out, *more, command="distill"):

@@ -17,6 +17,7 @@ from nerfdiff.results.intervals import Estimate
 from nerfdiff.stability.breaking import Breaking, Point
 from nerfdiff.stability.study import Study, Verdict
 from nerfdiff.stability.text import RULES, breaking_text, severity_text
+from nerfdiff.utils.spread import spread
 
 
 def stability_values(found: Sequence[Study], page: Path, views: int) -> list[dict[str, Any]]:
@@ -109,7 +110,7 @@ def _pictures(stress: DictConfig, verdict: Verdict, study: Study, page: Path, vi
 def _views(run: Run, scene: str, views: int) -> list[Path]:
     folder = run.file("predictions", str(run.row.strategy), scene, "rgb")
     paths = sorted(folder.glob("*.png")) if folder is not None else []
-    return [paths[(2 * i + 1) * len(paths) // (2 * min(views, len(paths)))] for i in range(min(views, len(paths)))]
+    return [paths[position] for position in spread(len(paths), views)]
 
 
 def _strip(rows: Sequence[Sequence[Path]]) -> str | None:

@@ -15,9 +15,10 @@ from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.cache import CachedReader
 from nerfdiff.data.draws import Draws, DrawSampler
 from nerfdiff.data.scene import MissingSplit, SceneReader
-from nerfdiff.data.views import EvaluationScenes, TrainingViews, spread
+from nerfdiff.data.views import EvaluationScenes, TrainingViews
 from nerfdiff.stopping import ignore_signals
 from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.spread import spread
 
 log = logging.getLogger(__name__)
 

@@ -9,6 +9,7 @@ from nerfdiff.data.batch import Sample
 from nerfdiff.data.draws import Draws
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.utils.errors import DataError, some
+from nerfdiff.utils.spread import spread
 
 log = logging.getLogger(__name__)
 
@@ -121,10 +122,3 @@ def position_of(reader: SceneReader, index: int, view: int) -> int:
 def view_numbers(names: Sequence[str]) -> list[int]:
     """Each view's number: its name where all names are numbers, else its position."""
     return [int(name) for name in names] if all(name.isdecimal() for name in names) else list(range(len(names)))
-
-
-def spread(count: int, wanted: int | None) -> list[int]:
-    """`wanted` of range(count), the middles of equal parts; all of them where None or too many are wanted."""
-    if wanted is None or wanted >= count:
-        return list(range(count))
-    return [(2 * i + 1) * count // (2 * wanted) for i in range(wanted)]

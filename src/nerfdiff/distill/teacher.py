@@ -27,7 +27,7 @@ class Teacher(Protocol):
     """Weight of guidance at the last step, where there is one."""
 
     view_weights: Float[Tensor, "views"] | None
-    """How much each view's loss weighs at the last step; None weighs all the same."""
+    """Weights of the views' losses at the last step; None weighs all the same."""
 
     def targets(self, step: int, rendered: Images | None) -> Images | None:
         """Return images in [0, 1] to fit the field to; None where it stays as it is, its renderings being the targets.

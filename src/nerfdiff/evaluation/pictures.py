@@ -12,6 +12,7 @@ from nerfdiff.metrics.predictions import read_prediction
 from nerfdiff.metrics.score import truth_from
 from nerfdiff.results.pictures import colour_depth, contact_sheet, orbit_video
 from nerfdiff.stability.judge import OK
+from nerfdiff.utils.spread import spread
 
 
 def sheet(run: EvaluationRun, strategies: Sequence[Strategy], path: Path) -> Path:
@@ -28,8 +29,7 @@ def sheet(run: EvaluationRun, strategies: Sequence[Strategy], path: Path) -> Pat
         scene = batch.scene_ids[0]
         predictions = {s.name: read_prediction(run.predictions / s.name, scene) for s in strategies}
         main = predictions[strategies[0].name]
-        n = len(main.views)
-        shown = [(2 * i + 1) * n // (2 * options.views) for i in range(min(n, options.views))]
+        shown = spread(len(main.views), options.views)
         suspect = " ?" if (main.verdict or OK) != OK else ""  # the row and the log say why
         names += [f"{scene[:10]} {main.views[i]}{suspect}" for i in shown]
         add("input", batch.source.expand(len(shown), -1, -1, -1))

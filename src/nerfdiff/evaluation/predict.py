@@ -126,7 +126,7 @@ def _write(
 ) -> float | None:
     """Save one scene's views, and what was `spent` on it, see `_shares`; their PSNR, if there is a truth."""
     verdict, signs = None, None
-    if run.judge is not None:
+    if run.judge is not None and views.field_queries > 0:  # of baselines, which ask no model, it knows nothing
         with run.autocast():
             signs = run.judge.signs(run.model, scene, views, run.familiar, run.settings.seed)
         verdict = run.judge.verdict(signs, views.status)

@@ -12,18 +12,19 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from nerfdiff.checkpoint import LoadedModel, load_model
+from nerfdiff.checkpoint import load_model
 from nerfdiff.compilation import compile_unets
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.diffusion.denoiser import cast_products
 from nerfdiff.diffusion.layout import channels_last
 from nerfdiff.distill.strategy import Strategy
+from nerfdiff.exported_model import LoadedModel
 from nerfdiff.model import NerfDiff
 from nerfdiff.results.environment import hardware
 from nerfdiff.stability.familiar import FAMILIAR, Familiar
 from nerfdiff.stability.judge import Judge
-from nerfdiff.stress.stress import Stress, stress_of
+from nerfdiff.stress.stress import Stress, row_fields, stress_of
 from nerfdiff.utils.config import auto_precision, plain
 from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.hashes import sha256_file, sha256_values
@@ -85,7 +86,6 @@ class RunSettings:
     @staticmethod
     def of(cfg: DictConfig) -> "RunSettings":
         """Read the settings of a composed config."""
-        stress = stress_of(cfg)
         same = ("run_name", "seed", "scenes_at_once", "minutes", "progress_every", "per_scene")
         return RunSettings(
             **{name: cfg[name] for name in same},
@@ -95,9 +95,7 @@ class RunSettings:
             compiled=cfg.compile != "none",
             orbit=instantiate(cfg.orbit),
             sheet=instantiate(cfg.sheet),
-            stress=stress and stress.axis,
-            severity=None if stress is None else float(stress.severity),
-            neutral=None if stress is None or stress.neutral is None else float(stress.neutral),
+            **row_fields(stress_of(cfg)),
         )
 
 

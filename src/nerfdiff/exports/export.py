@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class FieldExport:
-    """What can be made of one field; what several files need is computed once.
+    """Write the files of one field. What several of them need is computed once.
 
     Args:
         stands: how its scene stands.
@@ -149,5 +149,5 @@ def export_fields(cfg: DictConfig, fields: Sequence[str]) -> list[Path]:
 
 
 def field_name(path: Path) -> str:
-    """What a field's files are called: as the file, or as its folder where it is called like all fields."""
+    """Return the name of a field's files: the field's own, or its folder's where it is called like all fields."""
     return path.absolute().parent.name if path.name == FIELD else path.stem

@@ -31,7 +31,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class SurfaceSettings:
-    """How a surface is found in a field.
+    """Settings by which a surface is found in a field.
 
     What is kept of the field is what lies in the ball around the middle of the scene that all cameras at the input
     camera's distance have between near and far.
@@ -66,7 +66,7 @@ class SurfaceSettings:
                 raise ConfigError(f"mesh.{key}={getattr(self, key)}: expected {expected}")
 
     def surface(self, saved: SavedField, stands: Upright) -> Surface:
-        """Where the field's density passes `density`, coloured as cameras around it see it.
+        """Return the surface where the field's density passes `density`, coloured as cameras around it see it.
 
         Raises:
             DataError: the field is empty there.
@@ -151,7 +151,7 @@ def _of_one_piece(solid: Bool[np.ndarray, "n n n"], share: float) -> Bool[np.nda
 
 
 def _normals(points: Float[Tensor, "n 3"], faces: Int[np.ndarray, "m 3"]) -> Float[Tensor, "n 3"]:
-    """Unit normals of the corners: of the triangles around them, by their areas."""
+    """Return unit normals of the corners: of the triangles around them, by their areas."""
     index = torch.from_numpy(np.ascontiguousarray(faces)).long()
     a, b, c = (points[index[:, corner]] for corner in range(3))
     across = torch.linalg.cross(b - a, c - a)

@@ -1,4 +1,4 @@
-"""What a field is fitted for: the loss of its rays against the colours they should have, and regularisers."""
+"""The loss of the inner steps: of rays against the colours they should have, and regularisers."""
 
 import math
 from dataclasses import dataclass

@@ -9,9 +9,9 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from nerfdiff.data.scene import Scene
-from nerfdiff.data.views import spread
 from nerfdiff.inspection.bounds import ray_distance
 from nerfdiff.inspection.check import Finding
+from nerfdiff.utils.spread import spread
 
 
 @dataclass(frozen=True)

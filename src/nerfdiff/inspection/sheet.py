@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
 from nerfdiff.data.scene import Scene
-from nerfdiff.data.views import spread
 from nerfdiff.results.pictures import colour_depth, contact_sheet
+from nerfdiff.utils.spread import spread
 
 FRAME = (0.85, 0.1, 0.1)
 

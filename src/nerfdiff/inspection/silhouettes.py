@@ -13,8 +13,8 @@ from torch.nn.functional import adaptive_max_pool2d, max_pool2d
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.scene import Scene
-from nerfdiff.data.views import spread
 from nerfdiff.inspection.check import Finding
+from nerfdiff.utils.spread import spread
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,14 @@ from torch import Tensor
 
 from nerfdiff.cameras import Cameras
 from nerfdiff.data.scene import SceneReader
-from nerfdiff.data.views import position_of, spread
+from nerfdiff.data.views import position_of
 from nerfdiff.inspection.all_views import StrayCameras, refuse_missing_files
 from nerfdiff.inspection.bounds import scene_distances
 from nerfdiff.inspection.check import Check, Finding, Status, check_scene
 from nerfdiff.inspection.conventions import explanations
 from nerfdiff.inspection.sheet import Row, row_of
 from nerfdiff.utils.errors import UserError
+from nerfdiff.utils.spread import spread
 
 
 @dataclass(frozen=True)

@@ -118,7 +118,7 @@ METRICS = _table(
 )
 """By name, in the order in which all show them. `register` adds those that come with a config or with a row."""
 PACKAGE = tuple(METRICS.values())
-"""Those that a result row has fields for."""
+"""The metrics that a result row has fields for."""
 TAKEN = set(METRICS)
 """Names that no other metric can have: `results.row` adds those of a row's other fields."""
 

@@ -31,7 +31,7 @@ class Rules:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one scene with one seed.
+    """The result of one scene with one seed.
 
     Args:
         psnr: NaN where there is no result.
@@ -54,7 +54,7 @@ class Outcome:
 
 
 Outcomes = Mapping[tuple[int, str], Outcome]
-"""Of a strategy at one severity, by seed and scene."""
+"""Results of a strategy at one severity, by seed and scene."""
 
 
 @dataclass(frozen=True)
@@ -249,7 +249,7 @@ def _of(outcomes: Outcomes, key: tuple[int, str]) -> float | None:
 
 
 def _paired(first: Outcomes, second: Outcomes) -> dict[tuple[int, str], float]:
-    """How many dB the second have less, in scenes that both have."""
+    """Return by how many dB the second are lower, in scenes that both have."""
     pairs = {key: (_of(first, key), outcome.psnr) for key, outcome in second.items()}
     return {key: a - b for key, (a, b) in pairs.items() if a is not None and math.isfinite(b)}
 

@@ -1,4 +1,4 @@
-"""How far an input image is from those that a model was trained on, by the encoder's own features."""
+"""The distance of an input image from those that a model was trained on, by the encoder's own features."""
 
 import json
 from collections.abc import Iterable

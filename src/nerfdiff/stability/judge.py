@@ -18,6 +18,7 @@ from nerfdiff.stress.photo import object_mask
 from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.images import to_signed, to_unit
 from nerfdiff.utils.randomness import generator
+from nerfdiff.utils.spread import spread
 
 SIGNS = {
     "input_psnr": "the field shows the input view as another picture ({:.1f} dB)",
@@ -83,8 +84,7 @@ class Judge:
         found = {}
         if familiar is not None and (of_input := features(encoding)) is not None:
             found["unlike"] = float(familiar.distance(of_input)[0])
-        count = len(predicted.images)
-        chosen = [(2 * i + 1) * count // (2 * min(count, self.views)) for i in range(min(count, self.views))]
+        chosen = spread(len(predicted.images), self.views)
         images, cameras = predicted.images[chosen].clamp(0, 1), scene.target_cameras[:, chosen]
         first = model.render(encoding, cameras)
         if predicted.trace:

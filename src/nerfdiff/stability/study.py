@@ -124,9 +124,7 @@ def _study(
                     outcomes[axis, severity, strategy],
                     {} if others else clean.get(strategy, {}),
                     {} if strategy == "none" else none,
-                    _better({name: outcomes.get((axis, severity, name), {}) for name in BASELINES})
-                    if others
-                    else baseline,
+                    own if others else baseline,
                     _frechet(by_point[axis, severity, strategy]),
                     [] if others else _frechet(clean_runs.get(strategy, ())),
                 )

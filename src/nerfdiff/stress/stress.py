@@ -176,6 +176,14 @@ def stress_of(cfg: DictConfig) -> Stress | None:
     return Stress(stress.axis, stress.severity, cfg.seed, stress.neutral, **built)
 
 
+def row_fields(stress: Stress | None) -> dict[str, Any]:
+    """Return a row's fields of a stress; all None where there is none."""
+    if stress is None:
+        return dict.fromkeys(("stress", "severity", "neutral"))
+    neutral = None if stress.neutral is None else float(stress.neutral)
+    return {"stress": stress.axis, "severity": float(stress.severity), "neutral": neutral}
+
+
 def with_stress(cfg: DictConfig, command: str) -> DictConfig:
     """Return a config with the settings that its stress changes, where it has one.
 

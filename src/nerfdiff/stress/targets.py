@@ -2,6 +2,7 @@
 
 from nerfdiff.distill.teacher import Teacher
 from nerfdiff.distill.virtual_views import Images
+from nerfdiff.utils.spread import spread
 
 
 class AlienViews:
@@ -31,5 +32,4 @@ class AlienViews:
 
 def replaced_views(views: int, share: float) -> list[int]:
     """Return the numbers of the views that are replaced, the middles of equal parts."""
-    count = min(views, max(1, round(share * views)))
-    return [(2 * i + 1) * views // (2 * count) for i in range(count)]
+    return spread(views, max(1, round(share * views)))

@@ -13,6 +13,7 @@ from nerfdiff.metrics.score import Truth, truth_from
 from nerfdiff.results.pictures import contact_sheet
 from nerfdiff.sweeps.jobs import Group, shown_predictions
 from nerfdiff.utils.errors import UserError
+from nerfdiff.utils.spread import spread
 
 log = logging.getLogger(__name__)
 
@@ -35,10 +36,7 @@ def grid(path: Path, sweep: DictConfig, groups: Sequence[Group]) -> Path | None:
         predictions = {name: read_prediction(folder, scene) for name, folder in shown.items()}
         first = next(iter(predictions.values()))
         views = [view for view in first.views if all(view in p.views for p in predictions.values())]
-        views = [
-            views[(2 * i + 1) * len(views) // (2 * sweep.sheet.views)]
-            for i in range(min(len(views), sweep.sheet.views))
-        ]
+        views = [views[position] for position in spread(len(views), sweep.sheet.views)]
         names += [f"{scene[:10]} {view}" for view in views]
         if truth is not None:
             source = truth(scene, first.source_views[:1]).images

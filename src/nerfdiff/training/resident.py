@@ -26,19 +26,20 @@ from torch.utils.tensorboard import SummaryWriter
 
 from nerfdiff.averages import PowerAverages
 from nerfdiff.cameras import Cameras
-from nerfdiff.checkpoint import DTYPES, LoadedModel, export_model, load_model
+from nerfdiff.checkpoint import load_model
 from nerfdiff.compilation import compile_unets
 from nerfdiff.data.cache import CachedReader
 from nerfdiff.data.scene import SceneReader
-from nerfdiff.data.views import spread
 from nerfdiff.diffusion.denoiser import Condition
 from nerfdiff.diffusion.schedule import add_noise, alpha_sigma, expand, v_from_x0_eps
+from nerfdiff.exported_model import DTYPES, LoadedModel, export_model
 from nerfdiff.model import NerfDiff
 from nerfdiff.results.environment import git_state
 from nerfdiff.training.run import plain
 from nerfdiff.utils.errors import ConfigError, DataError, TrainingDiverged
 from nerfdiff.utils.images import to_signed
 from nerfdiff.utils.randomness import seed_of, spread_times
+from nerfdiff.utils.spread import spread
 
 log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 
 from nerfdiff.results.environment import environment
 from nerfdiff.results.row import ResultRow, append_row
-from nerfdiff.stress.stress import stress_of
+from nerfdiff.stress.stress import row_fields, stress_of
 from nerfdiff.training.callbacks.nonfinite import NonFiniteGuard
 from nerfdiff.utils.errors import TrainingDiverged, is_out_of_memory
 
@@ -25,7 +25,6 @@ def append_training_row(cfg: DictConfig, trainer: Trainer | None, error: Excepti
     guard = next((c for c in trainer.callbacks if isinstance(c, NonFiniteGuard)), None) if trainer is not None else None
     stability: dict[str, Any] = guard.stability.summary() if guard is not None else {}
     held_out = trainer.callback_metrics.get("val/psnr") if trainer is not None else None
-    stress = stress_of(cfg)
     status = "ok"
     if error is not None:
         status = "diverged" if isinstance(error, TrainingDiverged) else "oom" if is_out_of_memory(error) else "error"
@@ -42,9 +41,7 @@ def append_training_row(cfg: DictConfig, trainer: Trainer | None, error: Excepti
         seed=cfg.seed,
         overrides=None if hydra is None else list(hydra.overrides.task),
         psnr=None if held_out is None else float(held_out),
-        stress=stress and stress.axis,
-        severity=None if stress is None else float(stress.severity),
-        neutral=None if stress is None or stress.neutral is None else float(stress.neutral),
+        **row_fields(stress_of(cfg)),
         **environment(device, cfg.trainer.precision),
         **stability,
     )

@@ -19,7 +19,6 @@ from nerfdiff.checkpoint import (
     check_same_data,
     describe,
     differences,
-    export_model,
     last_checkpoint,
     load_model,
     read_checkpoint,
@@ -28,6 +27,7 @@ from nerfdiff.compilation import compile_unets
 from nerfdiff.data.datamodule import SceneDataModule
 from nerfdiff.diffusion.layout import channels_last
 from nerfdiff.diffusion.unet import AUTO
+from nerfdiff.exported_model import export_model
 from nerfdiff.inputs import LAST, find_weights
 from nerfdiff.model import settings_of
 from nerfdiff.processes import lost_process, watch

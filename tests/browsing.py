@@ -1,4 +1,8 @@
-"""A headless browser, in which pages have no network."""
+"""A headless browser, in which pages have no network.
+
+Each module of tests has its own, closed at its end: an open one leaves an event loop running in its thread, in which
+neither a second one nor any `asyncio.run` may start.
+"""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -11,7 +15,7 @@ NAMES = ("chromium", "chromium-browser", "google-chrome")
 ARGUMENTS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator:
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install -e '.[dev]'")
     found = next(filter(None, map(shutil.which, NAMES)), None)
@@ -23,7 +27,7 @@ def browser() -> Iterator:
         browser.close()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def open_page(browser) -> Iterator[Callable]:
     """Opens a page from disk, which lists in `complaints` what it logs as a warning and what it asks of any network."""
     contexts = []

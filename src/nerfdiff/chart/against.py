@@ -8,6 +8,7 @@ from nerfdiff.metrics.table import METRICS
 from nerfdiff.results.frame import Configuration
 from nerfdiff.results.intervals import Bootstrap, Estimate
 from nerfdiff.results.paired import difference
+from nerfdiff.results.row import ResultRow
 
 MODEL = ("ckpt_sha256", "weights", "model", "field")
 GEOMETRY = ("floaters", "depth_extent", "depth_abs_rel", "mask_iou")  # of fields alone
@@ -35,17 +36,21 @@ def reference_of(number: int, members: Sequence[int], found: Sequence[Configurat
 def leave_fields(members: Sequence[int], found: Sequence[Configuration]) -> dict[int, bool]:
     """Whether each configuration leaves a field (rather than views alone), as far as its row tells.
 
-    Rows do not say it outright. Of a field there is geometry to measure; baselines query none; where others of the
-    panel have geometry, one without has no field; and where nobody's was measured, the strategy's name says it.
+    Rows do not say it outright. A field has geometry to measure, and was fitted to K views where the denoiser was
+    asked; baselines query none. Where no row of the panel has either, the strategy's name alone says it.
     """
     rows = {number: found[number].row for number in members}
-    measured = {number: any(row.measured(name) is not None for name in GEOMETRY) for number, row in rows.items()}
-    some = any(measured.values())
-    return {
-        number: measured[number]
-        or not (row.field_queries == 0 or some or (row.strategy or "").partition("-")[0] in WITHOUT_FIELD)
-        for number, row in rows.items()
+    tells = {
+        n: row.K is not None or any(row.measured(name) is not None for name in GEOMETRY) for n, row in rows.items()
     }
+    some = any(tells.values())
+
+    def leaves(row: ResultRow) -> bool:
+        if row.field_queries == 0 or row.strategy in WITHOUT_FIELD:
+            return False
+        return not row.denoiser_calls or not some
+
+    return {number: tells[number] or leaves(row) for number, row in rows.items()}
 
 
 def has_interval(estimate: Estimate) -> bool:
@@ -54,10 +59,16 @@ def has_interval(estimate: Estimate) -> bool:
 
 @dataclass
 class Leads:
-    """Differences between configurations, scene by scene; every one is computed once."""
+    """Differences between configurations, scene by scene; every one is computed once.
+
+    Args:
+        fewest: scenes below which there is no interval: by chance alone n differences have one sign in one case of
+            2^(n-1), which no bootstrap of them sees.
+    """
 
     found: Sequence[Configuration]
     bootstrap: Bootstrap
+    fewest: int
     known: dict[tuple[str, int, int], Estimate | None] = field(default_factory=dict)
 
     def __call__(self, metric: str, number: int, other: int) -> Estimate | None:
@@ -65,7 +76,9 @@ class Leads:
         key = metric, number, other
         if key not in self.known:
             own, theirs = (self.found[each].scenes.get(metric, {}) for each in (number, other))
-            self.known[key] = difference(own, theirs, self.bootstrap)
+            estimate = difference(own, theirs, self.bootstrap)
+            few = len(own.keys() & theirs.keys()) < self.fewest
+            self.known[key] = Estimate(estimate.mean) if estimate is not None and few else estimate
         return self.known[key]
 
     def verdict(self, metric: str, number: int, other: int) -> str | None:

@@ -52,8 +52,8 @@ HOW = (
     "A point is a configuration: runs that agree in everything but their seed. Its name has what tells it from the "
     "others, a click shows all of its settings. Bars are {level:.0%} bootstrap intervals of the difference to "
     "{reference} with the same model, scene by scene, over scenes; the seeds of a scene are averaged first. Better or "
-    "worse is what its interval says; whatever reaches over zero is level. Fréchet distances are one number of a run: "
-    "they have no such interval. Seconds are the mean over seeds of the medians over scenes. "
+    "worse is what its interval says; whatever reaches over zero is level. Fréchet distances are one number of a run, "
+    "and fewer than {fewest} scenes are too few: they have no interval. The frontier is one of means. Seconds are the mean over seeds of the medians over scenes. "
     "Faint points are dominated: another is at least as good and as cheap, and better in one. Hollow: some runs failed."
 )
 """The page's words on its numbers."""
@@ -123,7 +123,7 @@ def build_chart(cfg: DictConfig) -> Path:
             "metrics": metrics,
             "costs": costs,
             "counts": f"{counts}; {datetime.now(UTC):%d %B %Y}",
-            "how": HOW.format(level=bootstrap.level, reference=cfg.picks.reference),
+            "how": HOW.format(level=bootstrap.level, reference=cfg.picks.reference, fewest=cfg.picks.fewest_scenes),
             "kinds": KINDS,
             "other": OTHER,
             "marks": {name: [mark.colour, mark.shape] for name, mark in _marks(content).items()},

@@ -13,7 +13,20 @@ from nerfdiff.utils.files import write_text
 
 PARTS = Path(__file__).parent / "page"
 SCRIPTS = (
-    *("state", "colours", "axes", "legend", "plot", "tip", "spending", "details", "pick", "cards", "table", "stability"),
+    *(
+        "state",
+        "colours",
+        "axes",
+        "legend",
+        "plot",
+        "tip",
+        "spending",
+        "details",
+        "pick",
+        "cards",
+        "table",
+        "stability",
+    ),
     *("keys", "main"),
 )
 

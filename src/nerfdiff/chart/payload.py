@@ -105,7 +105,7 @@ def measured(
             labels[number], names[number] = own, name
             references[number] = reference_of(number, panel.members, found, picks["reference"])
         solid |= {number for number, leaves in leave_fields(panel.members, found).items() if leaves}
-    leads = Leads(found, bootstrap)
+    leads = Leads(found, bootstrap, picks["fewest_scenes"])
     compared = [metric["field"] for metric in metrics]
     differences = [
         differences_to(number, reference, estimates, compared, leads) for number, reference in enumerate(references)

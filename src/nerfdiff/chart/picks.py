@@ -8,7 +8,9 @@ from nerfdiff.chart.against import Leads
 from nerfdiff.metrics.table import METRICS
 from nerfdiff.results.intervals import Estimate
 
-NO_INTERVALS = "no pick: without values per scene (scores/<strategy>/per_scene.csv) no lead can be told from noise"
+NO_INTERVALS = (
+    "no pick: a lead is told from noise by values per scene (scores/<strategy>/per_scene.csv), of at least {} scenes"
+)
 
 
 @dataclass(frozen=True)
@@ -45,8 +47,9 @@ class Picker:
     def __call__(self, members: Sequence[int]) -> list[dict[str, Any]]:
         """The three picks, as the page has them."""
         able = [n for n in members if self.cost["field"] in self.estimates[n] and self._has(n, self.fidelity)]
-        if not any(len(self.leads.found[n].scenes[self.fidelity]) > 1 for n in able):
-            return [asdict(Pick(name, None, NO_INTERVALS)) for name in ("fast", "balanced", "sharp")]
+        if not any(len(self.leads.found[n].scenes[self.fidelity]) >= self.leads.fewest for n in able):
+            reason = NO_INTERVALS.format(self.leads.fewest)
+            return [asdict(Pick(name, None, reason)) for name in ("fast", "balanced", "sharp")]
         return [asdict(pick) for pick in (self._fast(able), self._balanced(able), self._sharp(able))]
 
     def _fast(self, able: Sequence[int]) -> Pick:
@@ -57,9 +60,7 @@ class Picker:
             return Pick("fast", None, f"no pick: nothing here has a {self._label(self.fidelity)} to compare")
         chosen = min(kept, key=self._price)
         if chosen == self.reference:
-            told = (
-                f"{self._paid(chosen)}: nothing cheaper has a {self._label(self.fidelity)} that is not below its own."
-            )
+            told = f"{self._paid(chosen)} and no distillation: nothing cheaper keeps its {self._label(self.fidelity)}."
             return Pick("fast", chosen, told)
         told = f"{self._label(self.fidelity)} is not below that of {self._name()}"
         lead = _signed(self.leads(self.fidelity, chosen, self.reference), self.fidelity)
@@ -67,7 +68,9 @@ class Picker:
 
     def _balanced(self, able: Sequence[int]) -> Pick:
         sharper = [n for n in able if self._sharper(n)]
-        what = self._label(self.fidelity) + (f" of all that are sharper than {self._name()}" if sharper else "")
+        what = self._label(self.fidelity) + (
+            f" of all with a better {self._label(self.sharpness)} than {self._name()}" if sharper else ""
+        )
         return self._best("balanced", self.fidelity, sharper or able, what)
 
     def _sharp(self, able: Sequence[int]) -> Pick:

@@ -37,7 +37,7 @@ def write_png(
     dpi: int,
     lines: int,
 ) -> Path:
-    """One panel's chart of one metric against one cost, by colour and shape of the strategy; dominated points are faint.
+    """One panel's chart of one metric against one cost; dominated points are faint.
 
     As on the page, it has those alone that leave a field (unless none does), and bars are intervals of differences to
     the reference, whose own value is a broken line. The frontier's points have numbers, which lines below explain.

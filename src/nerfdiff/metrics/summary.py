@@ -104,7 +104,9 @@ def read_scores(path: Path) -> dict[str, dict[str, float]]:
             raise ValueError(f"{size} bytes are too many" if path.is_file() else "no file")
         with open(path, newline="", encoding="utf-8") as file:
             return {
-                line["scene"]: {name: float(cell) for name, cell in line.items() if name not in (*FACTS, *SPENT) and cell}
+                line["scene"]: {
+                    name: float(cell) for name, cell in line.items() if name not in (*FACTS, *SPENT) and cell
+                }
                 for line in csv.DictReader(file)
             }
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:

@@ -7,9 +7,9 @@ from typing import Any
 from nerfdiff.metrics.summary import read_scores
 from nerfdiff.metrics.table import named
 from nerfdiff.results.intervals import Bootstrap, Estimate, spread
-from nerfdiff.results.paired import SceneValues, difference, in_order, over_seeds
+from nerfdiff.results.paired import difference, in_order, over_seeds
 from nerfdiff.results.row import ResultRow
-from nerfdiff.sweeps.jobs import Group, Job, Labels, counterpart
+from nerfdiff.sweeps.jobs import Group, Labels, counterpart
 from nerfdiff.utils.errors import DataError
 
 TIMINGS = ("distill_s", "scene_s")

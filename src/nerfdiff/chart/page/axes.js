@@ -34,7 +34,7 @@ function metricAxis(found) {
   const pad = 0.06 * (high - low || Math.abs(high) || 1);
   const up = [low - pad, high + pad];
   const shown = byDifference() ? `${name}, difference to ${nameOf(panel().reference)}` : name;
-  const text = `${shown}${unit ? `, ${unit}` : ""}${better === "higher" ? "" : " (axis inverted: up is better)"}`;
+  const text = `${shown}${unit ? `, ${unit}` : ""}${better === "higher" ? "" : " (up is better)"}`;
   const range = better === "higher" ? up : up.reverse();
   return { range, title: { text: markup(text), standoff: 8 }, gridcolor: "#e8ecf1", zeroline: false, nticks: 8, tickformat: byDifference() ? "+" : "" };
 }

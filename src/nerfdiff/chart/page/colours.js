@@ -33,7 +33,7 @@ function mix(share) {
 }
 
 // {numeric, groups}, the groups in the order of the legend: numbers along a scale, of which not all stand there, or words
-// by kind, of which those beyond the colours are one. Strategies have the colours of their marks, on every page.
+// by kind, of which those beyond the colours are one. Strategies have the colours of their marks, in every panel.
 function colouring(numbers) {
   const found = [...new Set(numbers.map(colourValue))];
   if (state.colour === "strategy")

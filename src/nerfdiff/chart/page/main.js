@@ -50,9 +50,9 @@ function settle() {
   settleAxis();
 }
 
-// Differences are shown where all are compared with one reference.
+// Differences are shown where all are compared with one reference; published values are none.
 function settleAxis() {
-  const shown = [...(panel().reference === null ? [] : [["difference", `difference to ${nameOf(panel().reference)}`]]), ["value", "value"]];
+  const shown = [...(panel().reference === null || $("published").checked ? [] : [["difference", `difference to ${nameOf(panel().reference)}`]]), ["value", "value"]];
   fill($("axis"), shown, shown.some(([key]) => key === state.axis) ? state.axis : "value");
 }
 
@@ -104,7 +104,10 @@ function connect() {
   $("intervals").onchange = drawAll;
   $("axis").onchange = () => change({ axis: $("axis").value });
   $("only").onchange = () => change({ only: $("only").checked ? "3d" : "all" });
-  $("published").onchange = drawAll;
+  $("published").onchange = () => {
+    settleAxis();
+    drawAll();
+  };
   $("within").oninput = () => {
     const within = Number($("within").value);
     if ($("within").value === "" || !(within >= 0)) return;

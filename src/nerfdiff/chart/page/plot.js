@@ -59,8 +59,7 @@ function noteOn(numbers, published) {
   const left = panel().members.filter((number) => !members().includes(number));
   if (left.length) notes.push(`3D only leaves out what has views and no field: ${left.slice(0, 6).map(nameOf).join(", ")}${left.length > 6 ? ` and ${left.length - 6} more` : ""}.`);
   if (!canDiffer()) notes.push(noReference());
-  else if (!many() && !numbers.some((number) => reach(number).length)) notes.push(`${metricOf(state.metric).name}: no values per scene, so no interval says which differences are noise.`);
-  if (state.axis === "difference" && published.length) notes.push("Published values are no differences: the axis has values.");
+  else if (!many() && !numbers.some((number) => reach(number).length)) notes.push(`${metricOf(state.metric).name}: no values of enough scenes, so no interval says which differences are noise.`);
   const what = `${costOf(state.cost).name} or ${metricOf(state.metric).name}`;
   if (many()) notes.push(`Intervals of more than ${data.webgl_above} points are in the table only.`);
   const memory = costOf(state.cost).on_cpu;

@@ -67,10 +67,10 @@ function differenceText(number, field, unit = true) {
 }
 
 // Overrides as a list: those that tell configurations apart first, in bold.
-function overrideList(entry) {
+function overrideList(entry, short = false) {
   const labels = entry.labels ?? {};
   const told = (word) => Object.keys(labels).some((key) => `.${word.split("=")[0].replace(/^\++/, "")}`.endsWith(`.${key}`));
   const all = words(entry);
-  const lines = [...all.filter(told), ...all.filter((word) => !told(word))];
+  const lines = [...all.filter(told), ...(short ? [] : all.filter((word) => !told(word)))];
   return element("ul", { className: "words" }, ...lines.map((word) => element("li", {}, told(word) ? element("b", {}, word) : word)));
 }

@@ -10,7 +10,7 @@ function columns() {
   const own = members(), { reference } = panel(), seconds = costOf("scene_s") ? "scene_s" : state.cost;
   const keys = [...new Set(own.flatMap((number) => Object.keys(data.configurations[number].labels)))].filter((key) => key !== "strategy");
   const text = (title, csv, of) => ({ title, csv, text: of });
-  const measure = ({ field, name, unit }) => ({ title: `${name}${unit ? `, ${unit}` : ""}`, field });
+  const measure = ({ field, name, unit }) => ({ title: `${name}${unit && !name.includes("seconds") ? `, ${unit}` : ""}`, field });
   const there = ({ field }) => own.some((number) => value(number, field));
   const first = [metricOf(state.metric), costOf(seconds), ...(state.cost === seconds ? [] : [costOf(state.cost)])].filter(there);
   const rest = [...data.metrics, ...data.costs].filter((each) => there(each) && !first.includes(each));
@@ -19,7 +19,7 @@ function columns() {
   return [
     text("strategy", "strategy", (number) => data.configurations[number].strategy),
     ...first.map(measure),
-    ...(compared ? [{ title: `${name}, difference to ${to}`, difference: state.metric }, text("so it is", "verdict", (number) => verdict(number, state.metric))] : []),
+    ...(compared ? [{ title: `Δ ${name} to ${to}`, difference: state.metric }, text("verdict", "verdict", (number) => verdict(number, state.metric))] : []),
     ...keys.map((key) => text(key, key, (number) => data.configurations[number].labels[key] ?? "")),
     text("frontier", "frontier", (number) => (frontierOf(state.metric, state.cost).includes(number) ? "yes" : "")),
     ...rest.map(measure),
@@ -49,7 +49,8 @@ function drawTable() {
     columns: made.map((column) => ({ data: 0, className: column.text ? "dt-left" : "dt-right", render: cellOf(column) })),
     order: made.flatMap((column, at) => (column.field === state.metric ? [[at, sign(state.metric) > 0 ? "desc" : "asc"]] : [])),
     deferRender: true, pageLength: 25, scrollX: true, autoWidth: false, search: { search: asked },
-    createdRow: (row) => (row.tabIndex = 0),
+    createdRow: (row) => (row.tabIndex = -1),
+    drawCallback: () => $("table").tBodies[0]?.rows[0]?.setAttribute("tabindex", 0), // from it arrows go on
     columnControl: [["search"]],
     language: { search: "filter:", info: "_START_ to _END_ of _TOTAL_", infoFiltered: "(of _MAX_)" },
   });

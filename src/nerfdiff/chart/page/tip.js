@@ -14,7 +14,7 @@ function tipOf(found) {
     element("b", {}, nameOf(found)), line(state.metric), against(found), line(state.cost),
     element("div", { className: "note" }, `${seeds}, ${entry.scenes ?? "?"} scenes`),
     entry.failed ? bad(`${entry.failed} more failed`) : null, entry.fell_back ? bad(entry.fell_back) : null,
-    entry.small ? element("img", { src: entry.small, alt: "its first views" }) : overrideList(entry),
+    ...(entry.small ? [element("img", { src: entry.small, alt: "its first views" }), overrideList(entry, true)] : [overrideList(entry)]),
   ];
 }
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 from nerfdiff.metrics.table import METRICS
 from nerfdiff.results.frame import Configuration
@@ -15,22 +16,23 @@ GEOMETRY = ("floaters", "depth_extent", "depth_abs_rel", "mask_iou")  # of field
 WITHOUT_FIELD = ("cdm", "copy_input", "mean_image")
 
 
-def reference_of(number: int, members: Sequence[int], found: Sequence[Configuration], strategy: str) -> int | None:
-    """The member of that strategy with the same model which shares most settings; None where there is none."""
-    own = found[number].row
+def references_of(members: Sequence[int], found: Sequence[Configuration], strategy: str) -> dict[int, int | None]:
+    """For each member that of `strategy` with the same model which shares most settings; None where there is none."""
+    nones = [number for number in members if found[number].row.strategy == strategy]
 
-    def same_model(other: int) -> bool:
-        theirs = found[other].row
-        pairs = [(getattr(own, name), getattr(theirs, name)) for name in MODEL]
+    def same_model(number: int, other: int) -> bool:
+        pairs = [(getattr(found[number].row, name), getattr(found[other].row, name)) for name in MODEL]
         return all(a == b or a is None or b is None for a, b in pairs)  # a baseline has no model
 
-    def shared(other: int) -> int:
+    def shared(number: int, other: int) -> int:
         return len(set(found[number].settings) & set(found[other].settings))
 
-    if own.strategy == strategy:
-        return number
-    nones = [other for other in members if found[other].row.strategy == strategy and same_model(other)]
-    return max(nones, key=shared, default=None)
+    return {
+        number: number
+        if number in nones
+        else max((n for n in nones if same_model(number, n)), key=partial(shared, number), default=None)
+        for number in members
+    }
 
 
 def leave_fields(members: Sequence[int], found: Sequence[Configuration]) -> dict[int, bool]:

@@ -53,8 +53,9 @@ HOW = (
     "others, a click shows all of its settings. Bars are {level:.0%} bootstrap intervals of the difference to "
     "{reference} with the same model, scene by scene, over scenes; the seeds of a scene are averaged first. Better or "
     "worse is what its interval says; whatever reaches over zero is level. Fréchet distances are one number of a run, "
-    "and fewer than {fewest} scenes are too few: they have no interval. The frontier is one of means. Seconds are the mean over seeds of the medians over scenes. "
-    "Faint points are dominated: another is at least as good and as cheap, and better in one. Hollow: some runs failed."
+    "and fewer than {fewest} scenes are too few: they have no interval. Seconds are the mean over seeds of the medians "
+    "over scenes. The frontier is that of means; faint points are dominated: another is at least as good and as cheap, "
+    "and better in one. Hollow: some runs failed."
 )
 """The page's words on its numbers."""
 

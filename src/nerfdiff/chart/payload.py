@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from nerfdiff.chart.against import Leads, differences_to, leave_fields, reference_of
+from nerfdiff.chart.against import Leads, differences_to, leave_fields, references_of
 from nerfdiff.chart.labels import labels_of, names_of
 from nerfdiff.chart.panels import Panel, panels_of
 from nerfdiff.chart.picks import Picker
@@ -103,7 +103,8 @@ def measured(
         told = labels_of([found[number] for number in panel.members], unnamed)
         for number, own, name in zip(panel.members, told, names_of(told), strict=True):
             labels[number], names[number] = own, name
-            references[number] = reference_of(number, panel.members, found, picks["reference"])
+        for number, reference in references_of(panel.members, found, picks["reference"]).items():
+            references[number] = reference
         solid |= {number for number, leaves in leave_fields(panel.members, found).items() if leaves}
     leads = Leads(found, bootstrap, picks["fewest_scenes"])
     compared = [metric["field"] for metric in metrics]

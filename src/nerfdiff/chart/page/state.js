@@ -15,11 +15,19 @@ const both = (number) => value(number, state.metric) && value(number, state.cost
 const sign = (field) => (metricOf(field).better === "higher" ? 1 : -1);
 const words = (entry) => entry.overrides.map((number) => data.words[number]);
 
+// Computed once for each choice: whoever asks for thousands of points one by one asks often.
+const kept = {};
+function once(name, make) {
+  const choice = `${state.panel} ${state.only} ${state.metric} ${state.cost}`;
+  if (kept[name]?.choice !== choice) kept[name] = { choice, value: make() };
+  return kept[name].value;
+}
+
 // Those that leave a field: all of them where the switch is off, and where nobody does.
-const solid = () => panel().members.filter((number) => data.configurations[number].solid);
+const solid = () => once("solid", () => panel().members.filter((number) => data.configurations[number].solid));
 const only3d = () => state.only === "3d" && solid().length > 0;
 const members = () => (only3d() ? solid() : panel().members);
-const points = () => members().filter(both);
+const points = () => once("points", () => members().filter(both));
 const frontierOf = (metric, cost) => panel()[only3d() ? "frontiers_3d" : "frontiers"][metric]?.[cost] ?? [];
 const answers = () => panel().answers[only3d() ? "3d" : "all"];
 

@@ -108,7 +108,7 @@ def answering(folder: Path, scenes: list[str] = SIXTEEN) -> Path:
         psnr = {scene: round(hard[scene] + above + wave * (-1) ** at, 6) for at, scene in enumerate(scenes)}
         st_lpips = {scene: perceptual + 0.01 * (at % 3) for at, scene in enumerate(scenes)}
         spent = {scene: seconds + (15 - at) * (strategy == "ngd_sharp") for at, scene in enumerate(scenes)}
-        write_scores(folder / strategy, strategy, psnr, st_lpips_vgg=st_lpips, seconds=spent)
+        write_scores(folder / strategy, strategy, psnr, st_lpips_vgg=st_lpips, distill=spent)
         if strategy in ("ngd", "none"):
             write_sheet(folder / strategy)
         row = result(

@@ -139,19 +139,24 @@ def test_each_model_is_compared_with_its_own_reference(tmp_path):
 def test_what_a_scene_took_stands_beside_its_difficulty(known, tmp_path):
     """Scene s0 is the hardest; ngd_sharp spends most on it, ngd the same on all."""
     sharp, same = (known["configurations"][NAMES.index(name)]["spending"] for name in ("ngd_sharp", "ngd"))
-    assert sharp["seconds"]["rho"] == 1.0 and same["seconds"]["rho"] is None
-    assert sharp["seconds"]["psnr"][0] == 20.0 and sharp["seconds"]["spent"][0] == 35.0
+    assert sharp["distill"]["rho"] == 1.0 and same["distill"]["rho"] is None
+    assert sharp["distill"]["psnr"][0] == 20.0 and sharp["distill"]["spent"][0] == 35.0
     # a run of before has it in its predictions, where the first scene warms up
     for strategy in ("none", "ngd"):
         write_scores(tmp_path / strategy, strategy, {scene: 20.0 + at for at, scene in enumerate(SIXTEEN)})
     for at, scene in enumerate(SIXTEEN):
         path = tmp_path / "ngd" / "predictions" / "ngd" / scene / "scene.json"
         path.parent.mkdir(parents=True)
-        cost = {"seconds": 100.0 - at if at else 999.0, "denoiser_calls": at, "warm": at > 0}
-        path.write_text(json.dumps({"cost": cost, "stopped_by": "agreement"}))
+        cost = {
+            "distill": 100.0 - at if at else 999.0,
+            "denoiser_calls": at,
+            "warm": at > 0,
+            "stopped_by": "schedule" if at else "agreement",
+        }
+        path.write_text(json.dumps({"cost": cost}))
     rows = [result("cheap", folder="none"), result("good", folder="ngd")]
     none, ngd = content(chart(write_results(tmp_path, *rows)))["configurations"]
-    assert len(ngd["spending"]["seconds"]["spent"]) == 15 and ngd["spending"]["seconds"]["rho"] == 1.0
+    assert len(ngd["spending"]["distill"]["spent"]) == 15 and ngd["spending"]["distill"]["rho"] == 1.0
     assert ngd["spending"]["denoiser_calls"]["rho"] == -1.0
     assert none["spending"] is None and (none["adaptive"], ngd["adaptive"]) == (False, True)
     few = content(chart(tmp_path, spending_scenes=0))["configurations"][1]
@@ -160,6 +165,15 @@ def test_what_a_scene_took_stands_beside_its_difficulty(known, tmp_path):
     damaged = content(chart(tmp_path))
     assert damaged["configurations"][1]["spending"] is None
     assert any("what its scenes took cannot be read" in line for line in damaged["unread"])
+
+
+@pytest.mark.parametrize(
+    ("word", "adaptive"),
+    [("budget=adaptive", True), ("quality=good", True), ("seconds_per_scene=5", True), ("budget=minutes", False)],
+)
+def test_adaptive_budgets_are_told_by_their_overrides(tmp_path, word, adaptive):
+    known = content(chart(write_results(tmp_path, result(overrides=["strategy=ngd", word]))))
+    assert known["configurations"][0]["adaptive"] is adaptive
 
 
 def test_strategies_are_told_apart_without_colour():

@@ -40,8 +40,9 @@ def page(one_page):
 
 def drawn(page) -> dict[int, dict]:
     """Per configuration where it stands, how far its bar reaches, and its mark."""
+    ends = "trace.error_y.visible ? [-trace.error_y.arrayminus[at], trace.error_y.array[at]] : null"
     script = f"""{PLOT}.data.filter((trace) => ["frontier", "dominated"].includes(trace.meta)).flatMap((trace) =>
-        trace.customdata.map((number, at) => [number, {{ y: trace.y[at], symbol: trace.marker.symbol[at], bar: trace.error_y.visible ? [-trace.error_y.arrayminus[at], trace.error_y.array[at]] : null,
+        trace.customdata.map((number, at) => [number, {{ y: trace.y[at], symbol: trace.marker.symbol[at], bar: {ends},
             line: trace.marker.line.width[at] }}]))"""
     return dict(page.evaluate(script))
 
@@ -181,9 +182,11 @@ def test_a_point_shows_its_thumbnail_to_the_keyboard_too(page):
 def test_details_show_spending_against_difficulty(page):
     page.click("[data-pick=sharp] .link")
     assert page.locator("#scatter circle").count() == 16
-    assert "Spearman's ρ" in page.inner_text(".spending") and "seconds +1.00" in page.inner_text(".spending")
+    assert "Spearman's ρ" in page.inner_text(".spending") and "seconds of distillation +1.00" in page.inner_text(
+        ".spending"
+    )
     page.click("[data-pick=balanced] .link")
-    assert "seconds – (the same for all scenes)" in page.inner_text(".spending")
+    assert "seconds of distillation – (the same for all scenes)" in page.inner_text(".spending")
     assert "+1.00 [" in page.inner_text("#details table")  # its PSNR to none
 
 

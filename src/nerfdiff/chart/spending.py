@@ -8,23 +8,30 @@ from typing import Any
 
 from scipy.stats import spearmanr
 
-from nerfdiff.metrics.summary import LARGEST, SPENT
+from nerfdiff.metrics.summary import LARGEST
 from nerfdiff.results.frame import Configuration, Run
 from nerfdiff.results.paired import over_seeds
 
-MEASURED = tuple(name for name in SPENT if name != "stopped_by")
+MEASURED = ("distill", "denoiser_calls")  # seconds of distillation, and how often the denoiser was asked
+SCHEDULE = "schedule"  # what ends a scene that has had all steps of its budget
+ADAPTIVE = ("quality", "seconds_per_scene")
 FEWEST = 3  # scenes of which a rank correlation says something
 
 
 def is_adaptive(configuration: Configuration, spent: Sequence[Mapping[str, Mapping[str, Any]]]) -> bool:
-    """Whether its budget follows the scene: its overrides, its row or its scenes say so."""
-    said = any("adaptive" in word.partition("=")[2] for word in configuration.settings if "budget" in word)
-    stopped = any(getattr(run.row, "stopped_by", None) for run in configuration.runs)
-    return said or stopped or any(scene.get("stopped_by") for seed in spent for scene in seed.values())
+    """Whether its budget follows the scene: its overrides say so, or scenes that ended before their schedule did."""
+    settings = (word.lstrip("+").partition("=") for word in configuration.settings)
+    said = any(
+        key in ADAPTIVE or (key.partition(".")[0] == "budget" and "adaptive" in value) for key, _, value in settings
+    )
+    ends = {scene["stopped_by"] for seed in spent for scene in seed.values() if "stopped_by" in scene}
+    return said or bool(ends - {SCHEDULE})
 
 
 def spent_by(run: Run, warn: Callable[[str], object]) -> dict[str, dict[str, Any]]:
-    """Per scene of a run what `SPENT` names, of what is known; from its scores, else from its predictions.
+    """Per scene of a run what `MEASURED` names and why it ended, as far as is known.
+
+    It stands in the run's scores, and of runs of before in their predictions.
 
     The seconds of a scene that warmed the device up are left out.
     """
@@ -33,7 +40,7 @@ def spent_by(run: Run, warn: Callable[[str], object]) -> dict[str, dict[str, Any
         if path is not None and path.stat().st_size <= LARGEST:
             with open(path, newline="", encoding="utf-8") as file:
                 lines = list(csv.DictReader(file))
-            if lines and any(name in lines[0] for name in SPENT):
+            if lines and any(name in lines[0] for name in MEASURED):
                 return {line["scene"]: _known(line) for line in lines}
         return _from_predictions(run)
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
@@ -51,7 +58,7 @@ def _from_predictions(run: Run) -> dict[str, dict[str, Any]]:
         facts = json.loads(path.read_text(encoding="utf-8"))
         cost = dict(facts["cost"])
         if cost.get("warm") is False:
-            cost.pop("seconds", None)
+            cost.pop("distill", None)
         found[scene] = _known({"stopped_by": facts.get("stopped_by")} | cost)
     return found
 

@@ -1,11 +1,11 @@
 // What was spent on each scene of a configuration, beside how hard the scene is: the PSNR that the reference has on it.
 const WIDTH = 360, HEIGHT = 190, EDGE = { left: 46, right: 12, top: 10, bottom: 34 };
-const SPENT = { seconds: ["seconds", "s"], denoiser_calls: ["denoiser calls", ""] };
+const SPENT = { distill: ["seconds of distillation", "s"], denoiser_calls: ["denoiser calls", ""] };
 
 function spending(number) {
-  const found = data.configurations[number].spending;
+  const found = data.configurations[number].spending; // by what was spent
   if (!found) return null;
-  const wanted = state.cost === "denoiser_calls" ? ["denoiser_calls", "seconds"] : ["seconds", "denoiser_calls"];
+  const wanted = state.cost === "denoiser_calls" ? ["denoiser_calls", "distill"] : ["distill", "denoiser_calls"];
   const field = wanted.find((name) => found[name]), [name, unit] = SPENT[field];
   const lines = wanted.filter((each) => found[each]).map((each) => `${SPENT[each][0]} ${rho(found[each])}`);
   return element(

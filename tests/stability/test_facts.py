@@ -47,8 +47,9 @@ def test_a_grey_box_has_the_facts_that_are_counted_by_hand():
     image[:, 10:22, 6:30] = 0.25  # 12 rows, 24 columns
     found = dict(zip(FACTS, facts(scene(image))[0].tolist(), strict=True))
     expected = {
-        "near": 0.8, "far": 1.8, "size": (12 * 24 / SIZE**2) ** 0.5, "margin": 6 / SIZE, "across": (6 - 18) / SIZE,
-        "along": (10 - 26) / SIZE, "background": 0, "contrast": 0, "darkest": 64 / 255, "lightest": 64 / 255,
+        "near": 0.8, "far": 1.8, "size": (12 * 24 / SIZE**2) ** 0.5, "share": 24 / SIZE, "margin": 6 / SIZE,
+        "across": (6 - 18) / SIZE, "along": (10 - 26) / SIZE, "background": 0, "contrast": 0,
+        "darkest": 64 / 255, "lightest": 64 / 255,
     }  # fmt: skip
     assert {name: found[name] for name in expected} == pytest.approx(expected, abs=1e-6)
     assert found["focal"] == pytest.approx(float(input_cameras(1, SIZE, SIZE).K[0, 0, 0]) / SIZE)
@@ -56,7 +57,7 @@ def test_a_grey_box_has_the_facts_that_are_counted_by_hand():
 
 
 def test_how_far_beyond_is_counted_in_widths_of_the_range():
-    usual = torch.tensor([[1.0, 3.0]] * len(FACTS))
+    usual = torch.tensor([[1.0, 2.0, 3.0]] * len(FACTS))
     found = torch.full((len(FACTS),), 2.0)
     found[:3] = torch.tensor([4.0, 0.5, float("nan")])
     named = names_of(excess(found, usual))

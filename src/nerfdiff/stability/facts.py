@@ -19,6 +19,7 @@ FACTS = {
     "near": "the near bound is another than that of the training scenes",
     "far": "the far bound is another than that of the training scenes",
     "size": "the object is larger or smaller in its frame than the training images'",
+    "share": "the object fills more or less of its frame's height or width than in the training images",
     "margin": "the object is nearer to the frame's edge than the training images', or cut off by it",
     "across": "the object stands further left or right than the training images'",
     "along": "the object stands higher or lower than the training images'",
@@ -42,22 +43,23 @@ LEAST_WIDTH = 0.02
 
 def facts(scene: ViewBatch) -> Float[Tensor, "batch facts"]:
     """Measure the inputs of scenes, in the order of `FACTS`; NaN where there is too little of an object to measure."""
-    intrinsics, width = scene.source_cameras.K, scene.source_cameras.width
-    cameras = torch.stack([intrinsics[:, 0, 0] / width, scene.near, scene.far], 1)
+    focal = scene.source_cameras.K[:, 1, 1] / scene.source_cameras.height
+    cameras = torch.stack([focal, scene.near, scene.far], 1)
     pictures = torch.stack([torch.tensor(_of_picture(image)) for image in scene.source.cpu()])
     return torch.cat([cameras.cpu().float(), pictures.float()], 1)
 
 
-def usual_range(found: Float[Tensor, "images facts"]) -> Float[Tensor, "facts 2"]:
-    """Return the lower and upper ends between which all but a few of the training images' facts lie."""
-    ends = torch.nanquantile(found.double(), torch.tensor([USUAL, 1 - USUAL], dtype=torch.float64), dim=0).T
-    missing = (LEAST_WIDTH * ends.mean(1).abs() - (ends[:, 1] - ends[:, 0])).clamp_min(0) / 2
-    return torch.stack([ends[:, 0] - missing, ends[:, 1] + missing], 1).float()
+def usual_range(found: Float[Tensor, "images facts"]) -> Float[Tensor, "facts 3"]:
+    """Return the ends between which all but a few of the training images' facts lie, around their median."""
+    quantiles = torch.tensor([USUAL, 0.5, 1 - USUAL], dtype=torch.float64)
+    low, middle, high = torch.nanquantile(found.double(), quantiles, dim=0)
+    missing = (LEAST_WIDTH * middle.abs() - (high - low)).clamp_min(0) / 2
+    return torch.stack([low - missing, middle, high + missing], 1).float()
 
 
-def excess(found: Float[Tensor, "facts"], usual: Float[Tensor, "facts 2"]) -> Float[Tensor, "facts"]:
+def excess(found: Float[Tensor, "facts"], usual: Float[Tensor, "facts 3"]) -> Float[Tensor, "facts"]:
     """Return how far each fact lies beyond its range, in widths of the range; 0 within."""
-    low, high = usual.unbind(1)
+    low, _, high = usual.unbind(1)
     beyond = torch.maximum(low - found, found - high).clamp_min(0)
     return beyond / (high - low).clamp_min(1e-6)
 
@@ -77,6 +79,7 @@ def _of_picture(image: Picture) -> list[float]:
     grains = _laplacian(light)[twice[1:-1, 1:-1]].abs()
     return [
         float(mask.float().mean().sqrt()),
+        max(1 - (top + bottom) / height, 1 - (left + right) / width),
         min(top / height, bottom / height, left / width, right / width),
         (left - right) / width,
         (top - bottom) / height,

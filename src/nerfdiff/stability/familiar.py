@@ -2,9 +2,11 @@
 
 import json
 import logging
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -41,7 +43,7 @@ class Familiar:
         spread: standard deviation along each axis.
         rest: root mean square of what the axes leave, over dimensions and images.
         usual: distance that 99 % of images held out from the axes do not exceed.
-        ranges: of the training inputs' facts; None in files from before there were any.
+        ranges: lower end, median and upper end of the training inputs' facts; None in files from before there were any.
     """
 
     mean: Float[Tensor, "dim"]
@@ -49,7 +51,7 @@ class Familiar:
     spread: Float[Tensor, "kept"]
     rest: float
     usual: float
-    ranges: Float[Tensor, "facts 2"] | None = None
+    ranges: Float[Tensor, "facts 3"] | None = None
 
     @staticmethod
     def of(found: Float[Tensor, "images dim"], kept: int, known: Float[Tensor, "images facts"]) -> "Familiar":
@@ -83,6 +85,19 @@ class Familiar:
         """Return how far each fact of one scene's input lies beyond the training inputs' range, in its widths."""
         return {} if self.ranges is None else names_of(excess(facts(scene)[0], self.ranges))
 
+    def framing(self) -> dict[str, Any] | None:
+        """Return settings of a `Picture` with which it is framed as the training inputs were; None: unknown."""
+        if self.ranges is None:
+            return None
+        middle = {name: round(value, 4) for name, value in zip(FACTS, self.ranges[:, 1].tolist(), strict=True)}
+        return {
+            "fov": round(math.degrees(2 * math.atan(0.5 / middle["focal"])), 2),
+            "near": middle["near"],
+            "far": middle["far"],
+            "object_share": middle["share"],
+            "object_centre": [0.5 + middle["across"] / 2, 0.5 + middle["along"] / 2],
+        }
+
     def save(self, path: Path) -> None:
         """Write a file that `load` reads, in halves.
 
@@ -95,6 +110,16 @@ class Familiar:
         about = {"rest": self.rest, "usual": self.usual}
         with atomic(path) as temporary:
             save_file(tensors, temporary, {"familiar": json.dumps(about), "facts": json.dumps(list(FACTS))})
+
+    @staticmethod
+    def beside(weights: Path) -> "Familiar | None":
+        """Read what lies beside a model's weights, if anything does.
+
+        Raises:
+            DataError: it is damaged.
+        """
+        path = weights.parent / FAMILIAR
+        return Familiar.load(path) if path.is_file() else None
 
     @staticmethod
     def load(path: Path) -> "Familiar":

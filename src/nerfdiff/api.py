@@ -33,6 +33,8 @@ from nerfdiff.exported_model import LoadedModel
 from nerfdiff.exports.export import FORMATS, FieldExport
 from nerfdiff.exports.views import render_rgba, to_image
 from nerfdiff.fit.saved_field import SavedField, load_field, save_field
+from nerfdiff.stability.familiar import Familiar
+from nerfdiff.stability.mend import mend_of
 from nerfdiff.trajectories import Upright
 from nerfdiff.utils.config import auto_precision, plain
 from nerfdiff.utils.errors import BackgroundError, ConfigError
@@ -135,6 +137,8 @@ class Model:
                 doubts,
             )
             scene = picture_scene(cfg, size, mask.where)
+        if (mend := mend_of(cfg, Familiar.beside(self.loaded.path))) is not None:
+            scene = mend(scene)
         return cfg, scene.to(self.device), mask
 
     def distil_batch(self, cfg: DictConfig, batch: ViewBatch, mask: Mask | None = None) -> "Scene":

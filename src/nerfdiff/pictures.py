@@ -103,7 +103,7 @@ def _identity(cfg: DictConfig, model: Model, image: Path, mask: Mask | None) -> 
     """A digest of all that a scene depends on."""
     files = [sha256_file(file) for file in (image, model.loaded.path, cfg.picture.mask) if file is not None]
     found = None if mask is None else mask.where.tobytes().hex()
-    settings = [plain(cfg[key]) for key in ("strategy", "picture", "picture_views")]
+    settings = [plain(cfg[key]) for key in ("strategy", "picture", "picture_views", "mend_input", "mend")]
     return sha256_values([files, found, settings, cfg.seed, str(model.device)])
 
 

@@ -25,6 +25,7 @@ from nerfdiff.model import NerfDiff
 from nerfdiff.results.environment import hardware
 from nerfdiff.stability.familiar import Familiar
 from nerfdiff.stability.judge import Judge
+from nerfdiff.stability.mend import mend_of
 from nerfdiff.stress.stress import Stress, row_fields, stress_of
 from nerfdiff.utils.config import auto_precision, plain
 from nerfdiff.utils.errors import ConfigError
@@ -299,6 +300,8 @@ def _run(
     precision = cfg.precision if cfg.precision != "auto" else auto_precision(device.type)
     if precision not in PRECISIONS:
         raise ConfigError(f"precision must be auto, {', '.join(PRECISIONS)}, got {precision!r}")
+    familiar = Familiar.beside(loaded.path)
+    mend = mend_of(cfg, familiar)
     identity = (
         facts
         | {
@@ -315,6 +318,7 @@ def _run(
             "strategy": plain(cfg.strategy),
         }
         | (stress.identity if stress is not None else {})
+        | ({"mend": mend.identity} if mend is not None else {})
     )
     folder = Path(cfg.paths.output_dir) / f"{cfg.strategy.name}-{sha256_values(identity)[:8]}"
     model = loaded.model.to(device).requires_grad_(False)
@@ -326,10 +330,11 @@ def _run(
     compile_unets(model, cfg.compile, cfg.paths.compiled_dir)
     spent_on = [hardware(device), cfg.threads, cfg.scenes_at_once, model.renderer.chunk, in_pixels]
     settings = RunSettings.of(cfg)
+    load = load if stress is None else stress.on(load)
     return EvaluationRun(
         settings=settings,
         model=model,
-        load=load if stress is None else stress.on(load),
+        load=load if mend is None else lambda names: map(mend, load(names)),
         scene_ids=scene_ids,
         device=device,
         precision=precision,
@@ -340,6 +345,6 @@ def _run(
         rows_before=settings.results.stat().st_size if settings.results.is_file() else 0,
         data=data,
         judge=instantiate(cfg.judge),
-        familiar=Familiar.beside(loaded.path),
+        familiar=familiar,
         stress=stress,
     )

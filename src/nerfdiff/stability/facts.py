@@ -3,8 +3,6 @@
 No network is asked. A network's features tell other objects; these tell other cut-outs, frames, lenses and blurs.
 """
 
-from collections.abc import Sequence
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
@@ -34,6 +32,7 @@ FACTS = {
     "grain": "the object's surface is smoother or grainier than those of the training images",
 }
 """What each fact says where it is out of the training images' range."""
+OF_PICTURE = tuple(FACTS)[3:]
 USUAL = 0.01
 """Share of training images that each end of a range leaves out."""
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601
@@ -45,7 +44,7 @@ def facts(scene: ViewBatch) -> Float[Tensor, "batch facts"]:
     """Measure the inputs of scenes, in the order of `FACTS`; NaN where there is too little of an object to measure."""
     focal = scene.source_cameras.K[:, 1, 1] / scene.source_cameras.height
     cameras = torch.stack([focal, scene.near, scene.far], 1)
-    pictures = torch.stack([torch.tensor(_of_picture(image)) for image in scene.source.cpu()])
+    pictures = torch.stack([torch.tensor(list(of_picture(image).values())) for image in scene.source.cpu()])
     return torch.cat([cameras.cpu().float(), pictures.float()], 1)
 
 
@@ -64,11 +63,11 @@ def excess(found: Float[Tensor, "facts"], usual: Float[Tensor, "facts 3"]) -> Fl
     return beyond / (high - low).clamp_min(1e-6)
 
 
-def _of_picture(image: Picture) -> list[float]:
-    """Facts of a picture on white, from `size` on."""
+def of_picture(image: Picture) -> dict[str, float]:
+    """Measure a picture on white; NaN where there is too little of an object to measure."""
     mask = object_mask(image)
     if not mask.any():
-        return [0.0] + [float("nan")] * (len(FACTS) - 4)
+        return dict.fromkeys(OF_PICTURE, float("nan")) | {"size": 0.0}
     height, width = mask.shape
     rows, columns = (mask.any(axis).nonzero()[:, 0] for axis in (1, 0))
     top, left = int(rows[0]), int(columns[0])
@@ -77,22 +76,22 @@ def _of_picture(image: Picture) -> list[float]:
     once, twice = grown(mask, -1), grown(mask, -2)
     steps = torch.cat([image.diff(dim=axis).abs().sum(0).flatten() for axis in (1, 2)])
     grains = _laplacian(light)[twice[1:-1, 1:-1]].abs()
-    return [
-        float(mask.float().mean().sqrt()),
-        max(1 - (top + bottom) / height, 1 - (left + right) / width),
-        min(top / height, bottom / height, left / width, right / width),
-        (left - right) / width,
-        (top - bottom) / height,
-        float((1 - image[:, ~mask]).mean()) if (~mask).any() else 0.0,
-        _variation(image, mask & ~once),
-        _variation(image, once & ~twice),
-        float(torch.log(_rms(_laplacian(image)) / _rms(_laplacian(F.avg_pool2d(image[None], 2)[0])))),
-        float(torch.log(torch.quantile(steps, 0.995) / (torch.quantile(steps, 0.9) + 0.02) + 1e-3)),
-        float(light[mask].std(correction=0)),
-        float(torch.quantile(light[mask], 0.02)),
-        float(torch.quantile(light[mask], 0.98)),
-        float(torch.log(grains.median() + 1e-3)) if grains.numel() else float("nan"),
-    ]
+    return {
+        "size": float(mask.float().mean().sqrt()),
+        "share": max(1 - (top + bottom) / height, 1 - (left + right) / width),
+        "margin": min(top / height, bottom / height, left / width, right / width),
+        "across": (left - right) / width,
+        "along": (top - bottom) / height,
+        "background": float((1 - image[:, ~mask]).mean()) if (~mask).any() else 0.0,
+        "edge": _variation(image, mask & ~once),
+        "second_edge": _variation(image, once & ~twice),
+        "sharpness": float(torch.log(_rms(_laplacian(image)) / _rms(_laplacian(F.avg_pool2d(image[None], 2)[0])))),
+        "steepness": float(torch.log(torch.quantile(steps, 0.995) / (torch.quantile(steps, 0.9) + 0.02) + 1e-3)),
+        "contrast": float(light[mask].std(correction=0)),
+        "darkest": float(torch.quantile(light[mask], 0.02)),
+        "lightest": float(torch.quantile(light[mask], 0.98)),
+        "grain": float(torch.log(grains.median() + 1e-3)) if grains.numel() else float("nan"),
+    }
 
 
 def _variation(image: Picture, where: Bool[Tensor, "height width"]) -> float:
@@ -107,8 +106,3 @@ def _laplacian(image: Float[Tensor, "*c height width"]) -> Float[Tensor, "*c h w
 
 def _rms(values: Tensor) -> Tensor:
     return values.square().mean().sqrt() + 1e-4
-
-
-def names_of(beyond: Float[Tensor, "facts"], names: Sequence[str] = tuple(FACTS)) -> dict[str, float]:
-    """Name how far each fact lies beyond its range; those that could not be measured are left out."""
-    return {name: float(value) for name, value in zip(names, beyond, strict=True) if value == value}

@@ -3,7 +3,7 @@
 import json
 import logging
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,8 @@ from torch import Tensor
 
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.field.encoder import Encoding
-from nerfdiff.stability.facts import FACTS, excess, facts, names_of, usual_range
+from nerfdiff.stability.facts import FACTS, OF_PICTURE, excess, facts, of_picture, usual_range
+from nerfdiff.stress.photo import Picture
 from nerfdiff.utils.errors import DataError
 from nerfdiff.utils.files import atomic
 
@@ -82,14 +83,34 @@ class Familiar:
         return ((along / spread).square().mean(1) + beside).sqrt() / self.usual
 
     def beyond(self, scene: ViewBatch) -> dict[str, float]:
-        """Return how far each fact of one scene's input lies beyond the training inputs' range, in its widths."""
-        return {} if self.ranges is None else names_of(excess(facts(scene)[0], self.ranges))
+        """Return how far each fact of one scene's input lies beyond the training inputs' range, in its widths.
+
+        Those that could not be measured, or have no range, are left out.
+        """
+        return {} if self.ranges is None else _named(tuple(FACTS), facts(scene)[0], self.ranges)
+
+    def picture_beyond(self, image: Picture) -> dict[str, float]:
+        """The same of a picture alone.
+
+        Raises:
+            TypeError: there are no ranges.
+        """
+        found = torch.tensor(list(of_picture(image).values()))
+        return _named(OF_PICTURE, found, self.ranges[-len(OF_PICTURE) :])
+
+    def usual_value(self, fact: str) -> float:
+        """Return the training inputs' median of a fact.
+
+        Raises:
+            TypeError: there are no ranges.
+        """
+        return float(self.ranges[list(FACTS).index(fact), 1])
 
     def framing(self) -> dict[str, Any] | None:
         """Return settings of a `Picture` with which it is framed as the training inputs were; None: unknown."""
         if self.ranges is None:
             return None
-        middle = {name: round(value, 4) for name, value in zip(FACTS, self.ranges[:, 1].tolist(), strict=True)}
+        middle = {name: round(self.usual_value(name), 4) for name in FACTS}
         return {
             "fov": round(math.degrees(2 * math.atan(0.5 / middle["focal"])), 2),
             "near": middle["near"],
@@ -141,6 +162,11 @@ class Familiar:
             raise DataError(
                 f"{path}: cannot be read ({error}); delete it, or make it again (docs/stability.md)"
             ) from error
+
+
+def _named(names: Sequence[str], found: Tensor, usual: Tensor) -> dict[str, float]:
+    beyond = excess(found, usual).tolist()
+    return {name: value for name, value in zip(names, beyond, strict=True) if not math.isnan(value)}
 
 
 def measured(model, batches: Iterable[ViewBatch]) -> tuple[Float[Tensor, "images dim"], Float[Tensor, "images facts"]]:

@@ -21,7 +21,7 @@ class FixedTeacher:
     def __init__(self, images: Images, steps: int):
         self.images, self.steps = images, steps
 
-    def targets(self, step: int, rendered: Images | None) -> Images:
+    def targets(self, step: float | int, rendered: Images | None) -> Images:
         return self.images
 
 

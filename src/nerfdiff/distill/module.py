@@ -1,6 +1,7 @@
 """Test-time fine-tuning of scenes' fields with the frozen CDM (paper, "Fine-tuning Phase")."""
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from jaxtyping import Float
@@ -8,6 +9,7 @@ from lightning import LightningModule
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras
+from nerfdiff.distill.course import Course, Timekeeper
 from nerfdiff.distill.teacher import Teacher
 from nerfdiff.distill.trace import Step
 from nerfdiff.distill.virtual_views import VirtualViews
@@ -39,6 +41,7 @@ class NGDModule(LightningModule):
         fit: the inner steps' settings.
         seeds: of each scene's rays.
         objective: what the fields are fitted for, the paper's where it is not given.
+        keeper: shortens what there is no time for; None: there is no deadline.
 
     Raises:
         ConfigError: scenes with different numbers of views.
@@ -52,12 +55,14 @@ class NGDModule(LightningModule):
         fit: FitSettings,
         seeds: Sequence[tuple[int | str, ...]],
         objective: Objective | None = None,
+        keeper: Timekeeper | None = None,
     ):
         super().__init__()
         self.automatic_optimization = False
         self.field = field
         self.views, self.teachers, self.settings, self.seeds = views, teachers, fit, seeds
         self.objective = objective or Objective()
+        self.course, self._keeper = Course(teachers[0].steps), keeper
         if len({len(v) for v in views}) > 1:
             raise ConfigError(
                 f"scenes with {sorted({len(v) for v in views})} virtual views cannot be distilled together: "
@@ -78,8 +83,8 @@ class NGDModule(LightningModule):
 
     @property
     def steps(self) -> int:
-        """Number of times the teachers are asked for targets."""
-        return self.teachers[0].steps
+        """Length of the schedule: the number of times the teachers are asked for targets, where time is not short."""
+        return self.course.steps
 
     def train_dataloader(self) -> range:
         """Return the teachers' steps."""
@@ -115,37 +120,43 @@ class NGDModule(LightningModule):
         )
 
     def on_train_batch_start(self, step: int, batch_idx: int) -> int | None:
-        """End the run (-1) when every scene's parameters are non-finite."""
+        """End the run (-1) when every scene's parameters are non-finite, or at the end of the course."""
         self._alive = self._finite_on_host.tolist()
-        return None if any(self._alive) else -1
+        work = self.cameras.shape[1], self.settings.inner_steps
+        affordable = None if self._keeper is None else self._keeper.affordable(self.course.taken, *work)
+        return None if any(self._alive) and self.course.begin_step(affordable) else -1
 
     def training_step(self, step: int, batch_idx: int) -> None:
-        self._choose_views(step)
-        # render the field, for the teachers to guide by
-        with timed("guide"):
-            rendered = self._render_guidance() if self.teachers[0].follows_field else None
-        # ask the teachers for targets: the guided, denoised images
-        made = [
-            teacher.targets(step, None if rendered is None else rendered[scene])
-            if self._alive[scene]
-            else self._last_targets[scene]  # a scene that failed asks its teacher no more
-            for scene, teacher in enumerate(self.teachers)
-        ]
+        place = self.course.position
+        self._choose_views(place)
+        with self._measured("ask", self.cameras.shape[1]):
+            # render the field, for the teachers to guide by
+            with timed("guide"):
+                rendered = self._render_guidance() if self.teachers[0].follows_field else None
+            # ask the teachers for targets: the guided, denoised images
+            made = [
+                teacher.targets(place, None if rendered is None else rendered[scene])
+                if self._alive[scene]
+                else self._last_targets[scene]  # a scene that failed asks its teacher no more
+                for scene, teacher in enumerate(self.teachers)
+            ]
         stays = any(images is None for images in made)  # for all scenes alike
         targets = rendered if stays else torch.stack(made)
         # fit the field to them
-        self._set_rates(DECAYS[self.settings.lr_decay](step / self.steps))
+        self._set_rates(DECAYS[self.settings.lr_decay](place / self.steps))
         if stays:
             losses = targets.new_zeros(0, len(targets))
         else:
             self._weigh_views()
-            losses = self._fit(targets)
+            with self._measured("fit", self.settings.inner_steps):
+                losses = self._fit(targets)
         # record, and keep the last finite field
         first, last = (losses[0], losses[-1]) if len(losses) else (None, None)
         distance = first if rendered is None else _mse(self._chosen_of(rendered), self._chosen_of(targets))
         one = self.teachers[self._alive.index(True)]
         self._records.append((one.t, one.weight, first, last, distance))
         self._keep_finite(losses, targets)
+        self.course.end_step()
 
     def on_train_end(self) -> None:
         """Restore each scene's last finite field, or, where the fit made it worse, the field it began as.
@@ -157,15 +168,17 @@ class NGDModule(LightningModule):
         the field astray, the input view by more than `source_tolerance`. This holds for a last finite field too.
         """
         self.field.restore(self._good, ~self._finite)
-        if self._average is not None:
+        if self._average is not None and self._average.started:
             self.field.restore(self._average.snapshot(), self._finite)
         worse = torch.zeros_like(self._finite)
-        if self.settings.inner_steps > 0:
-            refined, after = self._distances(), self.field.snapshot()
-            self.field.restore(self._start, ~worse)
+        if self.settings.inner_steps > 0 and self.course.taken > 0:
+            with self._measured("end", self.cameras.shape[1]):
+                refined, after = self._distances(), self.field.snapshot()
+                self.field.restore(self._start, ~worse)
+                begun = self._distances()
             tolerances = self.settings.target_tolerance, self.settings.source_tolerance
             of_targets, of_source = (
-                10 ** (dB / 10) * first + 1e-6 for dB, first in zip(tolerances, self._distances(), strict=True)
+                10 ** (dB / 10) * first + 1e-6 for dB, first in zip(tolerances, begun, strict=True)
             )
             worse = ~((refined[0] <= of_targets) & (refined[1] <= of_source))
             self.field.restore(after, ~worse)
@@ -190,10 +203,14 @@ class NGDModule(LightningModule):
         t, *_, distance = self._records[-1]
         return t, None if distance is None else float(psnr_of_mse(distance.nanmean()))
 
-    def _choose_views(self, step: int) -> None:
+    def _measured(self, piece: str, count: int) -> AbstractContextManager:
+        return nullcontext() if self._keeper is None else self._keeper.measure(piece, count)
+
+    def _choose_views(self, place: float) -> None:
         """Choose the views of a step, for denoising and fitting alike, and begin to average where it is time."""
         for views in self.views:
-            views.choose(step, self.steps)
+            views.choose(place, self.steps)
+            views.until = self.course.until
         chosen = [views.chosen for views in self.views]
         self._chosen = None if chosen[0] is None else torch.stack(chosen)
         if self._chosen is not None:
@@ -204,7 +221,8 @@ class NGDModule(LightningModule):
             fitted = torch.cat([fitted, source], 1)
         self._chosen_to_fit = fitted
         self._batches.set_views(fitted)
-        if self._average is not None and step >= min(self.steps - 1, self.steps * (1 - self.settings.average)):
+        is_last = self.course.until >= self.steps
+        if self._average is not None and (is_last or place >= self.steps * (1 - self.settings.average)):
             self._average.start()
 
     def _chosen_of(self, values, fitted: bool = False):

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfdiff.diffusion.sampler import SamplerSettings
+from nerfdiff.diffusion.sampler import SamplerSettings, time_at
 from nerfdiff.diffusion.schedule import add_noise, alpha_sigma
 from nerfdiff.distill.autoguidance import Autoguidance
 from nerfdiff.distill.teacher import uses_current_rendering
@@ -142,9 +142,10 @@ class NGDTeacher:
         # Algorithm 1 begins with the renderings, noised: for t_max = 1 that is noise alone
         self._z = add_noise(self._last, views.noise(), *alpha_sigma(self.times[0]))
 
-    def targets(self, step: int, rendered: Images) -> Images | None:
-        t, t_next = self.times[step], self.times[step + 1]
-        recorded = self._host_times[step]
+    def targets(self, step: float | int, rendered: Images) -> Images | None:
+        until = step + 1 if self.views.until is None else self.views.until
+        t, t_next = time_at(self.times, step), time_at(self.times, until)
+        recorded = time_at(self._host_times, step)
         self.t, self.weight = float(recorded), float(self.guidance.weight(recorded))
         replaced = self.guidance.replaces(recorded)
         if replaced and self.at_full_guidance != "everything":

@@ -31,9 +31,13 @@ class VirtualViews:
         seed: of all noise; a view's noise depends on it and on the view's number alone.
         last: number of views that are left at the last step, see `choose`; None: all.
 
+    `until` is where the step in hand ends on the schedule; None: 1 further on.
+
     Raises:
         ConfigError: no views.
     """
+
+    until: float | None = None
 
     @torch.no_grad()
     def __init__(
@@ -76,17 +80,17 @@ class VirtualViews:
         """Images of all views by the single-image NeRF, in [0, 1]."""
         return self._condition.rendered
 
-    def choose(self, step: int, steps: int) -> None:
-        """Choose the views that step number `step` of `steps` denoises and fits: `chosen`, None for all.
+    def choose(self, step: float | int, steps: int) -> None:
+        """Choose the views that are denoised and fitted at a place on a schedule of `steps`: `chosen`, None for all.
 
         Their number falls evenly from all at the first step to `last` at the last. Those that are kept are spread out:
         in turn the one farthest from those kept already. Views that were dropped do not come back. After
         `choose_randomly`, each step has its own.
         """
         if self._table is not None:
-            self.chosen = self._table[step]
+            self.chosen = self._table[int(step)]
         elif self._order is not None:
-            left = round(len(self) + (self._last - len(self)) * step / max(1, steps - 1))
+            left = round(len(self) + (self._last - len(self)) * min(1, step / max(1, steps - 1)))
             self.chosen = self._order[:left].sort().values
 
     def choose_randomly(self, views: int, steps: int) -> None:

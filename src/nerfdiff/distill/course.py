@@ -1,0 +1,152 @@
+"""How far a distillation is on its schedule, how far its next step goes, and what a deadline leaves of both."""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+
+from nerfdiff.utils.errors import ConfigError
+
+SCHEDULE, DEADLINE = "schedule", "deadline"
+"""Why a distillation ended: it did all that its budget has, or less, for want of time."""
+REHEARSED = 2
+"""Views, steps and inner steps of the small distillation that measures the pace; its first step warms up."""
+
+
+class Course:
+    """A place on a schedule of so many steps, from 0 to `steps`. A step may be longer than 1, and end in between.
+
+    Diffusion times, learning rates and numbers of views depend on the place, not on how many steps were taken. So fewer
+    steps still run to the schedule's end.
+    """
+
+    def __init__(self, steps: int):
+        self.steps, self.position, self.until, self.taken = steps, 0.0, 0.0, 0
+        self.stopped_by = SCHEDULE
+
+    def begin_step(self, affordable: int | None = None) -> bool:
+        """Choose where the next step ends (`until`); return false where there is none.
+
+        Args:
+            affordable: steps for which there is time; None: there is no deadline.
+        """
+        left = self.steps - self.position
+        steps = math.ceil(left)
+        if affordable is not None and affordable < steps:
+            self.stopped_by, steps = DEADLINE, affordable
+        if steps < 1:
+            return False
+        self.until = float(self.steps) if steps == 1 else self.position + max(1.0, left / steps)
+        return True
+
+    def end_step(self) -> None:
+        """Go to where the step ends."""
+        self.position, self.taken = self.until, self.taken + 1
+
+
+@dataclass
+class Pace:
+    """Seconds of the pieces of one scene's distillation, as last measured; NaN where nothing was yet.
+
+    Args:
+        begin: of a virtual view before the first step.
+        ask: of a virtual view in each step: its rendering for the teacher, and its denoising.
+        fit: of an inner step.
+        end: of a virtual view after the last step: the check that the field became no worse.
+        steps: of a whole schedule.
+    """
+
+    begin: float = math.nan
+    ask: float = math.nan
+    fit: float = math.nan
+    end: float = math.nan
+    steps: int = 0
+
+    def step(self, views: int, inner_steps: int) -> float:
+        """Return the seconds of a step."""
+        return views * self.ask + inner_steps * self.fit
+
+
+@dataclass(frozen=True)
+class Deadline:
+    """When the field of a scene has to be there.
+
+    Args:
+        seconds: from its input image to its field; None: no matter when.
+        clock: that says the time in seconds.
+
+    Raises:
+        ConfigError: there is no time at all.
+    """
+
+    seconds: float | None = None
+    clock: Callable[[], float] = time.monotonic
+
+    def __post_init__(self):
+        if self.seconds is not None and not self.seconds > 0:
+            raise ConfigError(f"seconds_per_scene={self.seconds} must be more than 0, or null")
+
+    def begin(self, *args) -> "Timekeeper | None":
+        """Begin to count, see `Timekeeper`; None where there is no deadline."""
+        return None if self.seconds is None else Timekeeper(self, *args)
+
+
+class Timekeeper:
+    """Says how much can be done until the deadline, from what it measured. Each measurement waits for the device.
+
+    Args:
+        deadline: from now on.
+        pace: which is measured anew, and stays for the next scene.
+        scenes: that are distilled together.
+        device: that does the work.
+        rehearsal: do but little, to measure the pace.
+    """
+
+    def __init__(self, deadline: Deadline, pace: Pace, scenes: int, device: torch.device, rehearsal: bool = False):
+        self.pace, self.rehearsal, self._clock, self._device = pace, rehearsal, deadline.clock, device
+        self._scenes, self._until = scenes, self._now() + scenes * deadline.seconds
+        self.shortened = False
+
+    def _now(self) -> float:
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        return self._clock()
+
+    @contextmanager
+    def measure(self, piece: str, count: int) -> Iterator[None]:
+        """Measure `count` pieces of one kind, for each scene."""
+        start = self._now()
+        yield
+        if count:
+            setattr(self.pace, piece, (self._now() - start) / (count * self._scenes))
+
+    def plan(self, views: int, inner_steps: int) -> tuple[int, int]:
+        """Return how many views and inner steps there shall be, so that enough steps fit into the time that is left.
+
+        What is too much is taken in equal shares from the number of steps and from what each of them does. How many
+        there are is planned as they come, see `affordable`. Of the time at most half goes into what comes before and
+        after them.
+        """
+        if self.rehearsal:
+            return min(views, REHEARSED), min(inner_steps, REHEARSED)
+        left = max(0.0, (self._until - self._now()) / self._scenes)
+        ends = views * (self.pace.begin + self.pace.end)
+        full = ends + self.pace.steps * self.pace.step(views, inner_steps)
+        self.shortened = full > left
+        share = min(1.0, math.sqrt(left / full), left / (2 * ends)) if self.shortened else 1.0
+        return max(1, round(share * views)), min(inner_steps, max(1, round(share * inner_steps)))
+
+    def affordable(self, taken: int, views: int, inner_steps: int) -> int:
+        """Return for how many more steps there is time.
+
+        Args:
+            taken: steps that were taken already.
+        """
+        if self.rehearsal:
+            return REHEARSED - taken
+        left = (self._until - self._now()) / self._scenes - views * self.pace.end
+        step = self.pace.step(views, inner_steps)
+        return max(0, int(left / step)) if step > 0 else 10**9

@@ -98,7 +98,11 @@ class NGDModule(LightningModule):
     def on_train_start(self) -> None:
         self._start = self.field.snapshot()
         self._good = self._start
-        self._rendered: SceneImages | None = None
+        # the field as it begins is rendered already, unless it is rendered otherwise here
+        self._first = torch.stack([views.first_renderings for views in self.views])
+        same = self.settings.guidance(self._renderer) == self._renderer and not self.keeps_coarse
+        self._rendered: SceneImages | None = self._first if same else None
+        self._first_source = self._render_source()
         self._finite = torch.ones(len(self.field), dtype=torch.bool, device=self.device)
         self._finite_on_host = torch.ones(len(self.field), dtype=torch.bool, pin_memory=self.device.type == "cuda")
         self._fitted = self.cameras
@@ -173,19 +177,19 @@ class NGDModule(LightningModule):
         worse = torch.zeros_like(self._finite)
         if self.settings.inner_steps > 0 and self.course.taken > 0:
             with self._measured("end", self.cameras.shape[1]):
-                refined, after = self._distances(), self.field.snapshot()
-                self.field.restore(self._start, ~worse)
-                begun = self._distances()
-            tolerances = self.settings.target_tolerance, self.settings.source_tolerance
-            of_targets, of_source = (
-                10 ** (dB / 10) * first + 1e-6 for dB, first in zip(tolerances, begun, strict=True)
-            )
-            worse = ~((refined[0] <= of_targets) & (refined[1] <= of_source))
-            self.field.restore(after, ~worse)
+                views = self._render(self._chosen_of(self.cameras), self._renderer).images
+                source = self._render_source()
+            first, targets = self._chosen_of(self._first), self._chosen_of(self._last_targets)
+            for dB, now, before, truth in (
+                (self.settings.target_tolerance, views, first, targets),
+                (self.settings.source_tolerance, source, self._first_source, self._source),
+            ):
+                worse |= ~(_mse(now, truth) <= 10 ** (dB / 10) * _mse(before, truth) + 1e-6)
+            self.field.restore(self._start, worse)
         for scene, (finite, diverged) in enumerate(zip(self._finite.tolist(), worse.tolist(), strict=True)):
             self.statuses[scene] = "non-finite" if not finite else "diverged" if diverged else "ok"
         # module and Trainer hold each other: free the largest tensors now
-        del self._inner, self._batches, self._rendered
+        del self._inner, self._batches, self._rendered, self._first, self._first_source
 
     def trace(self, scene: int) -> list[Step]:
         """Return one scene's record, step by step. Waits for the device."""
@@ -214,7 +218,8 @@ class NGDModule(LightningModule):
         chosen = [views.chosen for views in self.views]
         self._chosen = None if chosen[0] is None else torch.stack(chosen)
         if self._chosen is not None:
-            self._rendered = None  # of other views
+            begun = place == 0 and self._rendered is not None
+            self._rendered = self._of_all_views(self._chosen_of(self._rendered)) if begun else None  # of other views
         fitted = self._chosen
         if fitted is not None and self.settings.fit_source:  # it comes after the virtual views
             source = torch.full_like(fitted[:, :1], self.cameras.shape[1])
@@ -306,11 +311,8 @@ class NGDModule(LightningModule):
             views.field_queries += renderer.samples_per_ray * rendering.opacity[0].numel()
         return rendering
 
-    def _distances(self) -> tuple[Float[Tensor, "scenes"], Float[Tensor, "scenes"]]:
-        """Return the mean squared errors of the last targets and of the input view."""
-        source = self._render(self.field.cameras[:, None], self._renderer).images
-        views = self._render(self._chosen_of(self.cameras), self._renderer).images
-        return _mse(views, self._chosen_of(self._last_targets)), _mse(source[:, 0], self._source)
+    def _render_source(self) -> Float[Tensor, "scenes 3 height width"]:
+        return self._render(self.field.cameras[:, None], self._renderer).images[:, 0]
 
 
 def _mse(images: Float[Tensor, "scenes *rest"], others: Float[Tensor, "scenes *rest"]) -> Float[Tensor, "scenes"]:

@@ -21,10 +21,15 @@ class Course:
 
     Diffusion times, learning rates and numbers of views depend on the place, not on how many steps were taken. So fewer
     steps still run to the schedule's end.
+
+    Args:
+        steps: length of the schedule.
+        planned: steps to be taken, of which none is shorter than 1; None: as many as it is long.
     """
 
-    def __init__(self, steps: int):
+    def __init__(self, steps: int, planned: int | None = None):
         self.steps, self.position, self.until, self.taken = steps, 0.0, 0.0, 0
+        self.planned = planned or steps
         self.stopped_by = SCHEDULE
 
     def begin_step(self, affordable: int | None = None) -> bool:
@@ -34,7 +39,7 @@ class Course:
             affordable: steps for which there is time; None: there is no deadline.
         """
         left = self.steps - self.position
-        steps = math.ceil(left)
+        steps = max(min(math.ceil(left), self.planned - self.taken), int(left > 0))
         if affordable is not None and affordable < steps:
             self.stopped_by, steps = DEADLINE, affordable
         if steps < 1:

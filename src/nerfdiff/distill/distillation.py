@@ -63,7 +63,7 @@ class Distillation:
             made = virtual.denoiser_calls, virtual.field_queries, module.trace(number), module.statuses[number]
             views = PredictedViews.of_field(saved, scene.target_cameras, *made)
             course = module.course
-            did = {"steps": course.taken, "steps_planned": course.steps, "stopped_by": course.stopped_by}
+            did = {"steps": course.taken, "steps_planned": course.planned, "stopped_by": course.stopped_by}
             predicted.append(replace(views, virtual_views=len(virtual), **did))
         return predicted
 

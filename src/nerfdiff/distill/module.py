@@ -1,9 +1,11 @@
 """Test-time fine-tuning of scenes' fields with the frozen CDM (paper, "Fine-tuning Phase")."""
 
+import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from lightning import LightningModule
 from torch import Tensor
@@ -44,7 +46,7 @@ class NGDModule(LightningModule):
         keeper: shortens what there is no time for; None: there is no deadline.
 
     Raises:
-        ConfigError: scenes with different numbers of views.
+        ConfigError: scenes with different numbers of views, or settings that contradict each other.
     """
 
     def __init__(
@@ -62,7 +64,8 @@ class NGDModule(LightningModule):
         self.field = field
         self.views, self.teachers, self.settings, self.seeds = views, teachers, fit, seeds
         self.objective = objective or Objective()
-        self.course, self._keeper = Course(teachers[0].steps), keeper
+        steps = teachers[0].steps
+        self.course, self._keeper = Course(steps, math.ceil(fit.steps_share * steps)), keeper
         if len({len(v) for v in views}) > 1:
             raise ConfigError(
                 f"scenes with {sorted({len(v) for v in views})} virtual views cannot be distilled together: "
@@ -76,6 +79,10 @@ class NGDModule(LightningModule):
                 f"into the model's {bins} evenly: choose a divisor of {bins}, or strategy.coarse=every_step"
             )
         self._split = bins // kept
+        if fit.error_rays > 0 and self.objective.patch > 1:
+            raise ConfigError(
+                f"strategy.error_rays={fit.error_rays} draws single rays: set strategy.patch=1, or it to 0"
+            )
         self.statuses = ["ok"] * len(field)
         self.cameras = Cameras.join([v.cameras for v in views])
         self._source = torch.cat([v.encoding.source for v in views])
@@ -116,7 +123,7 @@ class NGDModule(LightningModule):
             self._renderer,
             self._batches,
             self.optimizers().optimizer,
-            self.settings.rays,
+            max(1, round(self.settings.rays_share * self.settings.rays)),
             [generator(self.device, *seed, "rays") for seed in self.seeds],
             self.settings.cuda_graphs,
             FitLoss(self.objective, self.device),
@@ -151,7 +158,7 @@ class NGDModule(LightningModule):
         if stays:
             losses = targets.new_zeros(0, len(targets))
         else:
-            self._weigh_views()
+            self._weigh(rendered, targets)
             with self._measured("fit", self.settings.inner_steps):
                 losses = self._fit(targets)
         # record, and keep the last finite field
@@ -245,15 +252,36 @@ class NGDModule(LightningModule):
             return chosen
         return with_views(chosen.new_zeros(*self.cameras.shape, *chosen.shape[2:]), self._chosen, chosen)
 
-    def _weigh_views(self) -> None:
-        """Set how much views weigh, where a teacher says so; the input view weighs 1."""
-        if self.teachers[0].view_weights is None:
+    def _weigh(self, rendered: SceneImages | None, targets: SceneImages) -> None:
+        """Set how much rays weigh where a teacher says so of views, and how often they are drawn where errors say so.
+
+        The input view weighs 1, and its rays are drawn as often as if all were alike.
+        """
+        weights, of_views = targets.new_ones(targets.shape[:2])[..., None, None], self.teachers[0].view_weights
+        if of_views is not None:
+            weights = torch.stack([teacher.view_weights for teacher in self.teachers])[..., None, None]
+        by_error = self.settings.error_rays if rendered is not None else 0
+        shares = self._error_shares(rendered, targets, by_error) if by_error else torch.ones_like(weights)
+        if of_views is None and not by_error:
             return
-        weights = torch.stack([teacher.view_weights for teacher in self.teachers])
+        of_all = (weights / shares.clamp_min(1e-8)).expand(*targets.shape[:2], *targets.shape[-2:])
         if self.settings.fit_source:
-            weights = torch.cat([weights, torch.ones_like(weights[:, :1])], 1)
-        size = self._source.shape[-2:]
-        self._batches.set_weights(weights[..., None, None].expand(*weights.shape, *size))
+            source = torch.ones_like(of_all[:, :1])
+            of_all, shares = torch.cat([of_all, source], 1), torch.cat([shares.expand_as(of_all), source], 1)
+        self._batches.set_weights(of_all)
+        if by_error:
+            self._batches.set_shares(shares)
+
+    def _error_shares(
+        self, rendered: SceneImages, targets: SceneImages, by_error: float
+    ) -> Float[Tensor, "scenes views height width"]:
+        """Return how often rays of the chosen views are drawn, 1 on average; a pixel's neighbours count as it does."""
+        errors = (targets - rendered).square().mean(2).sqrt()
+        errors = F.avg_pool2d(errors, 3, 1, 1, count_include_pad=False)
+        chosen = self._of_all_views(self._chosen_of(torch.ones_like(errors)))  # targets of the others are no news
+        mean = ((errors * chosen).flatten(1).sum(1) / chosen.flatten(1).sum(1))[:, None, None, None]
+        relative = torch.where(mean > 0, errors / mean, 1.0)  # where there is no error all rays are alike
+        return chosen * (1 - by_error + by_error * relative)
 
     @timed("fit")
     def _fit(self, targets: SceneImages) -> Float[Tensor, "steps scenes"]:

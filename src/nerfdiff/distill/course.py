@@ -10,8 +10,9 @@ import torch
 
 from nerfdiff.utils.errors import ConfigError
 
-SCHEDULE, DEADLINE = "schedule", "deadline"
-"""Why a distillation ended: it did all that its budget has, or less, for want of time."""
+SCHEDULE, AGREEMENT, DEADLINE = "schedule", "agreement", "deadline"
+"""Why a distillation ended: it did all that its budget has; or less, as field and CDM agreed no better, or for want of
+time."""
 REHEARSED = 2
 """Views, steps and inner steps of the small distillation that measures the pace; its first step warms up."""
 
@@ -47,9 +48,33 @@ class Course:
         self.until = float(self.steps) if steps == 1 else self.position + max(1.0, left / steps)
         return True
 
-    def end_step(self) -> None:
-        """Go to where the step ends."""
+    def end_step(self, is_enough: bool = False) -> None:
+        """Go to where the step ends.
+
+        Args:
+            is_enough: what is left of the schedule shall be one step.
+        """
         self.position, self.taken = self.until, self.taken + 1
+        if is_enough and self.planned > self.taken + 1:
+            self.stopped_by, self.planned = AGREEMENT, self.taken + 1
+
+
+class Plateau:
+    """Tells when a value rises no longer.
+
+    Args:
+        patience: so many last values in which the best before them was not exceeded by `rise`.
+    """
+
+    def __init__(self, patience: int, rise: float):
+        self.patience, self.rise = patience, rise
+        self._values: list[float] = []
+
+    def __call__(self, value: float) -> bool:
+        """Take in one more value."""
+        self._values.append(value)
+        before, last = self._values[: -self.patience], self._values[-self.patience :]
+        return bool(before) and max(last) < max(before) + self.rise
 
 
 @dataclass

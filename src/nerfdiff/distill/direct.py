@@ -15,7 +15,7 @@ class FixedTeacher:
         steps: how many times they are asked for, to fit as long as the other methods do.
     """
 
-    t = weight = view_weights = None
+    t = weight = view_weights = gap = None
     follows_field = False
 
     def __init__(self, images: Images, steps: int):

@@ -11,7 +11,7 @@ from lightning import LightningModule
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras
-from nerfdiff.distill.course import Course, Timekeeper
+from nerfdiff.distill.course import Course, Plateau, Timekeeper
 from nerfdiff.distill.teacher import Teacher
 from nerfdiff.distill.trace import Step
 from nerfdiff.distill.virtual_views import VirtualViews
@@ -83,6 +83,11 @@ class NGDModule(LightningModule):
             raise ConfigError(
                 f"strategy.error_rays={fit.error_rays} draws single rays: set strategy.patch=1, or it to 0"
             )
+        if fit.patience is not None and len(field) > 1:
+            raise ConfigError(
+                f"strategy.patience={fit.patience} lets each scene end when it has enough: set scenes_at_once=1"
+            )
+        self._plateau = None if fit.patience is None else Plateau(fit.patience, fit.rise)
         self.statuses = ["ok"] * len(field)
         self.cameras = Cameras.join([v.cameras for v in views])
         self._source = torch.cat([v.encoding.source for v in views])
@@ -167,7 +172,7 @@ class NGDModule(LightningModule):
         one = self.teachers[self._alive.index(True)]
         self._records.append((one.t, one.weight, first, last, distance))
         self._keep_finite(losses, targets)
-        self.course.end_step()
+        self.course.end_step(self._is_enough(one))
 
     def on_train_end(self) -> None:
         """Restore each scene's last finite field, or, where the fit made it worse, the field it began as.
@@ -213,6 +218,12 @@ class NGDModule(LightningModule):
         """Return t of the last step and the mean PSNR of renderings against targets, in dB. Waits for the device."""
         t, *_, distance = self._records[-1]
         return t, None if distance is None else float(psnr_of_mse(distance.nanmean()))
+
+    def _is_enough(self, teacher: Teacher) -> bool:
+        """Return true if the field's renderings agree no better with the denoised images. Waits for the device."""
+        if self._plateau is None or teacher.gap is None:
+            return False
+        return self._plateau(float(psnr_of_mse(teacher.gap)))
 
     def _measured(self, piece: str, count: int) -> AbstractContextManager:
         return nullcontext() if self._keeper is None else self._keeper.measure(piece, count)

@@ -138,6 +138,7 @@ class NGDTeacher:
         self.times = self._host_times.to(views.encoding.source.device)
         self.t: float | None = None
         self.weight: float | None = None
+        self.gap: Float[Tensor, ""] | None = None
         self._last = to_signed(views.first_renderings)
         # Algorithm 1 begins with the renderings, noised: for t_max = 1 that is noise alone
         self._z = add_noise(self._last, views.noise(), *alpha_sigma(self.times[0]))
@@ -149,11 +150,12 @@ class NGDTeacher:
         self.t, self.weight = float(recorded), float(self.guidance.weight(recorded))
         replaced = self.guidance.replaces(recorded)
         if replaced and self.at_full_guidance != "everything":
-            self._last = to_signed(rendered).clamp(-1, 1)
+            self._last, self.gap = to_signed(rendered).clamp(-1, 1), None
         else:
             # denoise
             condition = rendered if self.on_current else None
             x0 = self.views.denoise(self._z, t.expand(len(self._z)), condition, self._deep)
+            self.gap = self.views.distance(to_unit(x0), rendered)
             # guide
             self._last = self.guidance(x0, to_signed(rendered), self._last, t)
         # step to the next time

@@ -31,7 +31,7 @@ class SDSTeacher:
         ConfigError: another `condition` or `weighting`, or times, steps or views that cannot be.
     """
 
-    t = weight = None
+    t = weight = gap = None
     follows_field = True
 
     def __init__(

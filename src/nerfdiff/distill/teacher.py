@@ -29,6 +29,10 @@ class Teacher(Protocol):
     view_weights: Float[Tensor, "views"] | None
     """Weights of the views' losses at the last step; None weighs all the same."""
 
+    gap: Float[Tensor, ""] | None
+    """Mean squared error of the renderings against the denoised images at the last step; None where they were not
+    compared."""
+
     def targets(self, step: float | int, rendered: Images | None) -> Images | None:
         """Return images in [0, 1] to fit the field to; None where it stays as it is, its renderings being the targets.
 

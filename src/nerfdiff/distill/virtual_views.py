@@ -38,6 +38,7 @@ class VirtualViews:
     """
 
     until: float | None = None
+    chosen: Tensor | None = None
 
     @torch.no_grad()
     def __init__(
@@ -62,7 +63,6 @@ class VirtualViews:
         self._condition = model.condition(encoding, cameras, torch.cat(rendered, 1))
         self._noise = [generator(encoding.source.device, *seed, view) for view in range(len(self))]
         self._weak: tuple[Autoguidance, Denoiser, Condition] | None = None
-        self.chosen: Tensor | None = None
         self._last = min(last or len(self), len(self))
         self._order = None if self._last == len(self) else farthest_first(cameras.centres[0])
         self._table: Tensor | None = None
@@ -168,6 +168,11 @@ class VirtualViews:
         parts = self._parts(len(z))
         deep = [None] * len(parts) if deep is None else deep
         return torch.cat([denoiser(z[p], t[p], condition[p], kept) for p, kept in zip(parts, deep, strict=True)])
+
+    def distance(self, images: Images, others: Images) -> Float[Tensor, ""]:
+        """Return the mean squared error of the chosen views' images."""
+        chosen = slice(None) if self.chosen is None else self.chosen
+        return (images[chosen] - others[chosen]).square().mean()
 
     def noise(self) -> Images:
         """Draw standard normal images, each from its own view's stream."""

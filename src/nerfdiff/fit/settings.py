@@ -42,6 +42,9 @@ class FitSettings:
             how much; each weighs as much less as it is drawn more often. 0 draws all alike.
         rays_share: of B, that are drawn.
         steps_share: of the teacher's steps, that are taken, each longer.
+        patience: steps in which the field's renderings agree no better with the denoised images, after which what is
+            left of the schedule is one step; None: all steps are taken.
+        rise: dB by which they have to agree better.
         views_last: number of virtual views that are left at the last step, see `VirtualViews.choose`; None keeps all.
 
     Raises:
@@ -66,6 +69,8 @@ class FitSettings:
     error_rays: float = 0.0
     rays_share: float = 1.0
     steps_share: float = 1.0
+    patience: int | None = None
+    rise: float = 0.0
 
     def __post_init__(self):
         if self.rays < 1 or self.inner_steps < 0:
@@ -81,6 +86,8 @@ class FitSettings:
         for name in ("rays_share", "steps_share"):
             if not 0 < getattr(self, name) <= 1:
                 raise ConfigError(f"strategy.{name}={getattr(self, name)}: expected a share above 0, to 1")
+        if self.patience is not None and self.patience < 1:
+            raise ConfigError(f"strategy.patience={self.patience} must be at least 1; null takes all steps")
         if self.views_last is not None and self.views_last < 1:
             raise ConfigError(f"strategy.views_last={self.views_last} must be at least 1; null keeps all views")
         for name, least in (("uniform", 1), ("importance", 0)):

@@ -1,11 +1,11 @@
-"""A distillation that has to be done by a time, on a clock of our own."""
+"""Distillations that end early: by a deadline, on a clock of our own, or as field and CDM agree no better."""
 
 import pytest
 import torch
-from test_ngd_module import distillation, guided, sampling, scene
+from test_ngd_module import distillation, guided, prior, sampling, scene
 from test_virtual_views import net
 
-from nerfdiff.distill.course import DEADLINE, SCHEDULE, Course
+from nerfdiff.distill.course import AGREEMENT, DEADLINE, SCHEDULE, Course, Plateau
 from nerfdiff.distill.direct import DirectTeacher
 from nerfdiff.distill.module import NGDModule
 from nerfdiff.distill.ngd import Guidance, NGDTeacher
@@ -121,7 +121,7 @@ def test_diffusion_times_run_to_their_end_in_longer_steps():
     """Half the steps are the steps of a schedule of half the length."""
 
     def images(steps, affordable):
-        views = VirtualViews(net(), net().encode(scene()), prior3(), 2, (0,))
+        views = VirtualViews(net(), net().encode(scene()), prior(3)(scene()), 2, (0,))
         teacher = NGDTeacher(views, steps, sampling(), Guidance("linear", 1.0, "last"), "first")
         course, rendered = Course(steps), torch.full((3, 3, 16, 16), 0.5)
         times = []
@@ -135,12 +135,6 @@ def test_diffusion_times_run_to_their_end_in_longer_steps():
     short, few = images(4, None), images(8, 4)
     assert short[0] == pytest.approx(few[0]) and len(few[0]) == 4
     torch.testing.assert_close(short[1], few[1], atol=1e-5, rtol=1e-5)
-
-
-def prior3():
-    from test_ngd_module import prior
-
-    return prior(3)(scene())
 
 
 def test_without_any_time_the_field_is_the_single_image_nerf(work):
@@ -172,11 +166,9 @@ def test_scenes_together_have_their_time_together(work):
 
 
 def test_only_the_first_scene_is_rehearsed(work):
-    calls = []
     _, method, first = run(work, 10 * FULL)
-    assert first > FULL
     _, _, second = run(work, None, method=method)
-    assert second <= FULL < first and not calls
+    assert second <= FULL < first
 
 
 def test_a_deadline_without_time_is_refused():
@@ -196,3 +188,63 @@ def test_strides_are_even_and_end_at_the_end():
         course.end_step()
     assert places == [(0, 1), (1, 2), (2, 3)] and course.stopped_by == SCHEDULE
     assert not Course(3).begin_step(0)
+
+
+@pytest.mark.parametrize(
+    ("patience", "rise", "enough"),
+    [(1, 0.0, 3), (2, 0.0, 4), (1, 0.5, 1), (3, 0.0, None), (1, -9.0, None)],
+)
+def test_a_plateau_is_where_the_best_of_before_is_not_exceeded(patience, rise, enough):
+    plateau, values = Plateau(patience, rise), [30.0, 30.4, 31.0, 30.9, 30.8, 31.2]
+    assert next((number for number, value in enumerate(values) if plateau(value)), None) == enough
+
+
+def agreeing(gaps, **options):
+    """Distil with the agreement (dB) of each step given."""
+
+    class Told(NGDTeacher):
+        def targets(self, step, rendered):
+            made = super().targets(step, rendered)
+            self.gap = None if (told := next(gaps)) is None else torch.tensor(10.0 ** (-told / 10))
+            return made
+
+    def teacher(views):
+        return Told(views, STEPS, sampling(), Guidance("linear", 1.0, "last"), "current")
+
+    return distillation(teacher, inner_steps=1, rays=16, lr_planes=1e-3, **options).distil(net(), [scene()], 0)
+
+
+def test_what_is_left_is_one_step_where_agreement_rises_no_longer():
+    module = agreeing(iter([30.0, 31.0, 31.0, 31.1, 33.0, 9.0]), patience=2, rise=0.2)
+    assert module.course.taken == 5 and module.course.position == STEPS and module.course.stopped_by == AGREEMENT
+    assert module.views[0].denoiser_calls == 5 * 3 and module.statuses == ["ok"]
+    assert module.trace(0)[-1].t == pytest.approx(float(sampling().times(STEPS)[4]))
+    still = agreeing(iter([30.0 + number for number in range(STEPS)]), patience=2, rise=0.2)
+    assert still.course.taken == STEPS and still.course.stopped_by == SCHEDULE
+    late = agreeing(iter([*map(float, range(10)), 8.0, 8.0]), patience=1, rise=0.0)  # one step is left in any case
+    assert late.course.taken == STEPS and late.course.stopped_by == SCHEDULE
+    unknown = agreeing(iter([None] * STEPS), patience=1, rise=0.0)
+    assert unknown.course.taken == STEPS
+
+
+def test_agreement_is_of_renderings_and_denoised_images():
+    views = VirtualViews(net(), net().encode(scene()), prior(3)(scene()), 2, (0,))
+    teacher = NGDTeacher(views, 4, sampling(), Guidance("constant", 0.5, "current"), "first")
+    rendered = torch.rand(3, 3, 16, 16, generator=torch.Generator().manual_seed(1))
+    targets = teacher.targets(0, rendered)
+    # guided images are halfway between both
+    assert float(teacher.gap) == pytest.approx(4 * float((targets - rendered).square().mean()), rel=1e-3)
+    views.chosen = torch.tensor([1])
+    targets = teacher.targets(1, rendered)
+    assert float(teacher.gap) == pytest.approx(4 * float((targets - rendered)[1].square().mean()), rel=1e-3)
+    full = NGDTeacher(views, 4, sampling(), Guidance("constant", 1.0, "current"), "first")
+    full.targets(0, rendered)
+    assert full.gap is None
+
+
+def test_scenes_together_cannot_end_by_themselves():
+    method = distillation(guided(), patience=2)
+    with pytest.raises(ConfigError, match="scenes_at_once=1"):
+        method.distil(net(), [scene("a"), scene("b")], seed=0)
+    with pytest.raises(ConfigError, match="patience=0"):
+        distillation(guided(), patience=0)

@@ -18,7 +18,7 @@ from nerfdiff.utils.files import write_text
 BASE = "none"
 """The strategy whose PSNR says how hard a scene is."""
 SPENT = ("seconds", "denoiser_calls", "field_queries", "steps")
-STATED = ("budget=adaptive", "quality=", "seconds_per_scene=")
+STATED = ("budget=adaptive", "quality=good", "quality=draft", "seconds_per_scene=")
 """How overrides begin by which a scene is given what it needs, or what there is time for."""
 
 

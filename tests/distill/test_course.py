@@ -217,6 +217,7 @@ def agreeing(gaps, **options):
 def test_what_is_left_is_one_step_where_agreement_rises_no_longer():
     module = agreeing(iter([30.0, 31.0, 31.0, 31.1, 33.0, 9.0]), patience=2, rise=0.2)
     assert module.course.taken == 5 and module.course.position == STEPS and module.course.stopped_by == AGREEMENT
+    assert module.course.planned == STEPS
     assert module.views[0].denoiser_calls == 5 * 3 and module.statuses == ["ok"]
     assert module.trace(0)[-1].t == pytest.approx(float(sampling().times(STEPS)[4]))
     still = agreeing(iter([30.0 + number for number in range(STEPS)]), patience=2, rise=0.2)

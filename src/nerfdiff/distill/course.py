@@ -30,7 +30,7 @@ class Course:
 
     def __init__(self, steps: int, planned: int | None = None):
         self.steps, self.position, self.until, self.taken = steps, 0.0, 0.0, 0
-        self.planned = planned or steps
+        self.planned = self._most = planned or steps
         self.stopped_by = SCHEDULE
 
     def begin_step(self, affordable: int | None = None) -> bool:
@@ -40,7 +40,7 @@ class Course:
             affordable: steps for which there is time; None: there is no deadline.
         """
         left = self.steps - self.position
-        steps = max(min(math.ceil(left), self.planned - self.taken), int(left > 0))
+        steps = max(min(math.ceil(left), self._most - self.taken), int(left > 0))
         if affordable is not None and affordable < steps:
             self.stopped_by, steps = DEADLINE, affordable
         if steps < 1:
@@ -55,8 +55,8 @@ class Course:
             is_enough: what is left of the schedule shall be one step.
         """
         self.position, self.taken = self.until, self.taken + 1
-        if is_enough and self.planned > self.taken + 1:
-            self.stopped_by, self.planned = AGREEMENT, self.taken + 1
+        if is_enough and self._most > self.taken + 1:
+            self.stopped_by, self._most = AGREEMENT, self.taken + 1
 
 
 class Plateau:

@@ -31,7 +31,7 @@ class PredictedViews:
         field_queries: points at which a field was evaluated.
         virtual_views: K, how many views a field was fitted to, where it was.
         steps, steps_planned: of the teacher, that were taken, and that the budget has.
-        stopped_by: why they ended: `schedule`, all were taken, or `deadline`, something was left out for want of time.
+        stopped_by: why they ended: `schedule`, all were taken; or `agreement` or `deadline`, something was left out.
         field: the field that the images are rendered from, where the method has one.
         trace: of its fitting, where it was fitted.
         status: `ok`, or why the field is not the one that the method ended with.

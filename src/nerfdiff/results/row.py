@@ -99,7 +99,7 @@ class ResultRow(make_dataclass("_Measured", _NUMBERS, bases=(_Identity,), kw_onl
     fitted to, the most of any scene. `fid_n` is the number of images on either side of `fid` and `fd_st_vgg`; `n_views`
     counts all scored images; `consistency_n` scenes were measured for consistency. Scenes' counts have medians, too:
     `steps_median` is how many steps the teacher took, of `steps_planned`; `stopped_by` counts why scenes ended: by
-    their `schedule`, all of it done, or by a `deadline`, with less. `fallbacks` counts the scenes whose
+    their `schedule`, all of it done; by `agreement` or a `deadline`, with less. `fallbacks` counts the scenes whose
     distillation failed and which kept an earlier field; `error` says how; where all did, the status is `diverged`.
     `suspects` counts the scenes that the judge suspects, and `verdict` is `ok`, or says of how many what it suspects.
     The last three are of the training run that made the checkpoint.

@@ -431,7 +431,7 @@ def test_one_view_and_one_ray_give_numbers(gamma):
 class Failing:
     """The same images until a step, and from there on what is no image."""
 
-    t = weight = view_weights = None
+    t = weight = view_weights = gap = None
     follows_field, steps = False, 6
 
     def __init__(self, images, at, value=float("nan")):

@@ -241,6 +241,9 @@ def test_agreement_is_of_renderings_and_denoised_images():
     full = NGDTeacher(views, 4, sampling(), Guidance("constant", 1.0, "current"), "first")
     full.targets(0, rendered)
     assert full.gap is None
+    overshooting = NGDTeacher(views, 4, sampling(), Guidance("constant", 0.5, "last"), "first")
+    overshooting.targets(0, rendered)
+    assert overshooting.gap is None
 
 
 def test_scenes_together_cannot_end_by_themselves():

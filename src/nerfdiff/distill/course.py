@@ -165,9 +165,10 @@ class Timekeeper:
         left = max(0.0, (self._until - self._now()) / self._scenes)
         ends = views * (self.pace.begin + self.pace.end)
         full = ends + self.pace.steps * self.pace.step(views, inner_steps)
-        self.shortened = full > left
-        share = min(1.0, math.sqrt(left / full), left / (2 * ends)) if self.shortened else 1.0
-        return max(1, round(share * views)), min(inner_steps, max(1, round(share * inner_steps)))
+        share = min(1.0, math.sqrt(left / full), left / (2 * ends)) if full > left else 1.0
+        planned = max(1, round(share * views)), min(inner_steps, max(1, round(share * inner_steps)))
+        self.shortened = planned != (views, inner_steps)
+        return planned
 
     def affordable(self, taken: int, views: int, inner_steps: int) -> int:
         """Return for how many more steps there is time.

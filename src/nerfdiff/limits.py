@@ -74,6 +74,7 @@ LIMITS: dict[str, tuple[float, float, str]] = {
     "picture_size": (1, 2**14, "from 1 to 16384 pixels"),
     "scenes_at_once": AT_LEAST_1,
     "mean_image_scenes": AT_LEAST_1,
+    "seconds_per_scene": (math.nextafter(0, 1), math.inf, "more than 0, or null"),
     "minutes": (math.nextafter(0, 1), math.inf, "more than 0, or null"),
     "progress_every": ABOVE_0,
     "processes": AT_LEAST_1,

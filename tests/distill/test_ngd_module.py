@@ -359,10 +359,10 @@ def test_a_field_is_not_fitted_to_its_own_renderings(fit):
     assert last.loss_first > 0 and module.statuses == ["ok", "ok"] and module.views[0].denoiser_calls == 6
     frozen = distilled("fit", {**fit, "lr_planes": 0.0, "lr_decoder": 0.0})
     assert frozen.trace(0)[2].agreement == last.agreement  # of the same images, drawn towards the same field
-    # three renderings of the field (at its beginning, and before the last step) and of what it is compared with
+    # at its beginning, twice where weights are kept; before the last step; at the end; and the input view
     view = 16 * 16 * module.views[0].model.renderer.samples_per_ray
     fitted = 2 * 3 * 64 * module.views[0].model.renderer.samples_per_ray
-    views = 3 + 2 * (4 if "coarse" in fit else 3) + 2 * (3 + 1)
+    views = 3 + (2 * 4 if "coarse" in fit else 3) + 3 + 2
     assert module.views[0].field_queries == views * view + fitted
     unguided = distilled("nothing", fit, compare="last")
     assert unguided.views[0].denoiser_calls == 12 and unguided.trace(0)[0].loss_first is not None
@@ -389,9 +389,9 @@ def test_renderings_for_the_teacher_have_samples_of_their_own(monkeypatch):
         seen.clear()
         fit = {"guidance_uniform_samples": counts[0], "guidance_importance_samples": counts[1]}
         module = distillation(TEACHERS["ngd"], **fit).distil(net, [scene()], seed=0)
-        assert seen == 4 * [used] + 4 * [own]
+        assert seen == [own] + (4 if counts[0] else 3) * [used] + 2 * [own]  # begun with the virtual views' renderings
         queries[counts] = module.views[0].field_queries
-    assert queries[None, None] - queries[3, 0] == 4 * 3 * view * (sum(own) - 3)
+    assert queries[None, None] - queries[3, 0] == 3 * view * (3 * sum(own) - 4 * 3)
     assert distillation(TEACHERS["direct"], **fit).distil(net, [scene()], seed=0).statuses == ["ok"]
 
 
@@ -431,7 +431,7 @@ def test_one_view_and_one_ray_give_numbers(gamma):
 class Failing:
     """The same images until a step, and from there on what is no image."""
 
-    t = weight = view_weights = None
+    t = weight = view_weights = gap = None
     follows_field, steps = False, 6
 
     def __init__(self, images, at, value=float("nan")):

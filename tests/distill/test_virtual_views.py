@@ -86,8 +86,8 @@ def test_what_is_dropped_is_neither_denoised_rendered_nor_fitted(fit_source, coa
     module = distillation(teacher, views_last=1, **options).distil(of, [scene()], 0)
     assert every.views[0].denoiser_calls == 4 * 3 and module.views[0].denoiser_calls == 3 + 2 + 2 + 1
     view = 16 * 16 * of.renderer.samples_per_ray
-    # four steps, and the two renderings at the end
-    assert every.views[0].field_queries - module.views[0].field_queries == (4 + 2 * 2) * view
+    # three steps, and the rendering at the end
+    assert every.views[0].field_queries - module.views[0].field_queries == (4 + 2) * view
     assert module.statuses == ["ok"] and len(module.trace(0)) == 4
     with pytest.raises(ConfigError, match="deep_every=1"):
         virtual(of, last=2).deep_features(DeepReuse(2, 1))

@@ -90,6 +90,27 @@ def test_every_scene_leaves_its_field_views_orbit_and_trace(strategy, data, run,
     assert next(tmp_path.glob(f"{strategy}-*/sheet.png")).stat().st_size > 1000
 
 
+@pytest.mark.parametrize(
+    ("word", "steps", "why"), [("quality=draft", 2, "schedule"), ("seconds_per_scene=1e-3", 0, "deadline")]
+)
+def test_what_scenes_were_given_and_why_they_ended_is_written_down(word, steps, why, data, run, tmp_path):
+    row = distill(config(data, run, tmp_path, word, "sheet.scenes=0", "orbit.frames=0"))
+    assert (row.steps_median, row.steps_planned, row.stopped_by) == (steps, 3 if why == "deadline" else 2, f"{why} 2")
+    assert row.field_queries_median * 2 == row.field_queries and row.denoiser_calls_median * 2 == row.denoiser_calls
+    with open(next(tmp_path.glob("ngd-*/scores/ngd/per_scene.csv"))) as file:
+        lines = list(csv.DictReader(file))
+    assert [(int(line["steps"]), line["stopped_by"]) for line in lines] == [(steps, why)] * 2
+    assert all(float(line["distill"]) > 0 and int(line["field_queries"]) > 0 for line in lines)
+    cost = json.loads((scene_folder(tmp_path, "ngd", "scene0") / "scene.json").read_text())["cost"]
+    assert (cost["steps"], cost["stopped_by"]) == (steps, why)
+
+
+def test_a_deadline_that_a_strategy_cannot_keep_is_told(data, run, tmp_path, caplog):
+    small = "sheet.scenes=0", "orbit.frames=0", "strategy.steps=1"
+    distill(config(data, run, tmp_path, "strategy=cdm", "seconds_per_scene=5", *small))
+    assert "cdm takes its time" in caplog.text
+
+
 def test_k_is_the_number_of_views_that_fields_were_fitted_to(data, run, tmp_path, caplog):
     """Π of the scene's own views: the input view and 4 others, or 2 by eval_stride, whatever is asked for."""
     small = "sheet.scenes=0", "orbit.frames=0", "budget.inner_steps=1", "budget.steps=2"

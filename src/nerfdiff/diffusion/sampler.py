@@ -180,6 +180,12 @@ def time_steps(n: int, t_max: float, t_min: float, spacing: str, device=None) ->
     return times.float().to(device)
 
 
+def time_at(times: Float[Tensor, "times"], step: float | int) -> Float[Tensor, ""]:
+    """Return the time at a place on a schedule; between two steps it is on the line between their times."""
+    before = int(step)
+    return times[before] if before == step else times[before].lerp(times[before + 1], step - before)
+
+
 def sample(
     denoise: Callable[[Images, Tensor], Images],
     z: Images,

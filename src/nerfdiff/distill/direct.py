@@ -15,13 +15,13 @@ class FixedTeacher:
         steps: how many times they are asked for, to fit as long as the other methods do.
     """
 
-    t = weight = view_weights = None
+    t = weight = view_weights = gap = None
     follows_field = False
 
     def __init__(self, images: Images, steps: int):
         self.images, self.steps = images, steps
 
-    def targets(self, step: int, rendered: Images | None) -> Images:
+    def targets(self, step: float | int, rendered: Images | None) -> Images:
         return self.images
 
 

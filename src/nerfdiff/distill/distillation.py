@@ -2,13 +2,15 @@
 
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import torch
 from lightning import Callback, Trainer
 
 from nerfdiff.data.batch import ViewBatch
+from nerfdiff.distill.course import DEADLINE, Deadline, Pace, Timekeeper
 from nerfdiff.distill.module import NGDModule
 from nerfdiff.distill.priors import Prior
 from nerfdiff.distill.strategy import PredictedViews
@@ -22,11 +24,12 @@ from nerfdiff.fit.settings import FitSettings
 from nerfdiff.model import NerfDiff
 from nerfdiff.utils.config import from_keys
 from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.spread import spread
 
 log = logging.getLogger(__name__)
 
 
-@from_keys(fit=FitSettings, objective=Objective)
+@from_keys(fit=FitSettings, objective=Objective, deadline=Deadline)
 @dataclass(frozen=True)
 class Distillation:
     """Encode once, fit the field to the teacher's images of the virtual views, render.
@@ -36,6 +39,8 @@ class Distillation:
         teacher: makes the teacher of a scene from its virtual views.
         views_at_once: views denoised in one batch, which bounds memory.
         objective: what the field is fitted for.
+        deadline: by which the field has to be there; less is computed where time is short.
+        pace: of this strategy here, as far as it was measured.
     """
 
     name: str
@@ -44,6 +49,8 @@ class Distillation:
     fit: FitSettings
     views_at_once: int
     objective: Objective = field(default_factory=Objective)
+    deadline: Deadline = field(default_factory=Deadline)
+    pace: Pace = field(default_factory=Pace, compare=False)
 
     def predict(
         self, model: NerfDiff, scenes: Sequence[ViewBatch], seed: int, callbacks: Sequence[Callback] = ()
@@ -55,7 +62,9 @@ class Distillation:
             saved = SavedField(module.field.alone(number), model.renderer)
             made = virtual.denoiser_calls, virtual.field_queries, module.trace(number), module.statuses[number]
             views = PredictedViews.of_field(saved, scene.target_cameras, *made)
-            predicted.append(replace(views, virtual_views=len(virtual)))
+            course = module.course
+            did = {"steps": course.taken, "steps_planned": course.planned, "stopped_by": course.stopped_by}
+            predicted.append(replace(views, virtual_views=len(virtual), **did))
         return predicted
 
     def distil(
@@ -75,19 +84,41 @@ class Distillation:
         """
         if len({scene.source.shape for scene in scenes}) > 1:
             raise ConfigError("scenes whose images differ in size cannot be distilled together: set scenes_at_once=1")
+        begin = partial(self.deadline.begin, self.pace, len(scenes), scenes[0].source.device)
+        keeper = begin()
+        if keeper is not None and not self.pace.steps:
+            self._distil(model, scenes, seed, (), begin(True))
+        return self._distil(model, scenes, seed, callbacks, keeper)
+
+    def _distil(
+        self,
+        model: NerfDiff,
+        scenes: Sequence[ViewBatch],
+        seed: int,
+        callbacks: Sequence[Callback],
+        keeper: Timekeeper | None,
+    ) -> NGDModule:
         # encode, one by one, so that a scene's numbers do not depend on the others
         seeds = [(seed, "distil", *scene.scene_ids) for scene in scenes]
         with torch.no_grad():
             encodings = [model.encode(scene) for scene in scenes]
         triplane = Triplane.join([encoding.triplane for encoding in encodings])
         # place the virtual views
-        views = [
-            VirtualViews(model, encoding, self.prior(scene), self.views_at_once, own, self.fit.views_last)
-            for encoding, scene, own in zip(encodings, scenes, seeds, strict=True)
-        ]
+        cameras, fit = [self.prior(scene) for scene in scenes], self.fit
+        if keeper is not None:
+            count, inner_steps = keeper.plan(cameras[0].shape[1], fit.inner_steps)
+            cameras, fit = [of[:, spread(of.shape[1], count)] for of in cameras], replace(fit, inner_steps=inner_steps)
+        with nullcontext() if keeper is None else keeper.measure("begin", cameras[0].shape[1]):
+            views = [
+                VirtualViews(model, encoding, of, self.views_at_once, own, self.fit.views_last)
+                for encoding, of, own in zip(encodings, cameras, seeds, strict=True)
+            ]
+            teachers = [self.teacher(v) for v in views]
         # fit the field to the teachers' images
-        teachers = [self.teacher(v) for v in views]
-        module = NGDModule(RefinedField(triplane, model.decoder), views, teachers, self.fit, seeds, self.objective)
+        module = NGDModule(RefinedField(triplane, model.decoder), views, teachers, fit, seeds, self.objective, keeper)
+        if keeper is not None and keeper.shortened:
+            module.course.stopped_by = DEADLINE
+        self.pace.steps = module.steps
         device = scenes[0].source.device
         with torch.enable_grad(), _quiet("lightning.pytorch"):
             trainer = Trainer(

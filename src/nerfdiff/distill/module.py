@@ -1,13 +1,17 @@
 """Test-time fine-tuning of scenes' fields with the frozen CDM (paper, "Fine-tuning Phase")."""
 
+import math
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from lightning import LightningModule
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras
+from nerfdiff.distill.course import Course, Plateau, Timekeeper
 from nerfdiff.distill.teacher import Teacher
 from nerfdiff.distill.trace import Step
 from nerfdiff.distill.virtual_views import VirtualViews
@@ -39,9 +43,10 @@ class NGDModule(LightningModule):
         fit: the inner steps' settings.
         seeds: of each scene's rays.
         objective: what the fields are fitted for, the paper's where it is not given.
+        keeper: shortens what there is no time for; None: there is no deadline.
 
     Raises:
-        ConfigError: scenes with different numbers of views.
+        ConfigError: scenes with different numbers of views, or settings that contradict each other.
     """
 
     def __init__(
@@ -52,12 +57,15 @@ class NGDModule(LightningModule):
         fit: FitSettings,
         seeds: Sequence[tuple[int | str, ...]],
         objective: Objective | None = None,
+        keeper: Timekeeper | None = None,
     ):
         super().__init__()
         self.automatic_optimization = False
         self.field = field
         self.views, self.teachers, self.settings, self.seeds = views, teachers, fit, seeds
         self.objective = objective or Objective()
+        steps = teachers[0].steps
+        self.course, self._keeper = Course(steps, math.ceil(fit.steps_share * steps)), keeper
         if len({len(v) for v in views}) > 1:
             raise ConfigError(
                 f"scenes with {sorted({len(v) for v in views})} virtual views cannot be distilled together: "
@@ -71,6 +79,15 @@ class NGDModule(LightningModule):
                 f"into the model's {bins} evenly: choose a divisor of {bins}, or strategy.coarse=every_step"
             )
         self._split = bins // kept
+        if fit.error_rays > 0 and self.objective.patch > 1:
+            raise ConfigError(
+                f"strategy.error_rays={fit.error_rays} draws single rays: set strategy.patch=1, or it to 0"
+            )
+        if fit.patience is not None and len(field) > 1:
+            raise ConfigError(
+                f"strategy.patience={fit.patience} lets each scene end when it has enough: set scenes_at_once=1"
+            )
+        self._plateau = None if fit.patience is None else Plateau(fit.patience, fit.rise)
         self.statuses = ["ok"] * len(field)
         self.cameras = Cameras.join([v.cameras for v in views])
         self._source = torch.cat([v.encoding.source for v in views])
@@ -78,8 +95,8 @@ class NGDModule(LightningModule):
 
     @property
     def steps(self) -> int:
-        """Number of times the teachers are asked for targets."""
-        return self.teachers[0].steps
+        """Length of the schedule: the number of times the teachers are asked for targets, where time is not short."""
+        return self.course.steps
 
     def train_dataloader(self) -> range:
         """Return the teachers' steps."""
@@ -93,7 +110,11 @@ class NGDModule(LightningModule):
     def on_train_start(self) -> None:
         self._start = self.field.snapshot()
         self._good = self._start
-        self._rendered: SceneImages | None = None
+        # the field as it begins is rendered already, unless it is rendered otherwise here
+        self._first = torch.stack([views.first_renderings for views in self.views])
+        same = self.settings.guidance(self._renderer) == self._renderer and not self.keeps_coarse
+        self._rendered: SceneImages | None = self._first if same else None
+        self._first_source = self._render_source()
         self._finite = torch.ones(len(self.field), dtype=torch.bool, device=self.device)
         self._finite_on_host = torch.ones(len(self.field), dtype=torch.bool, pin_memory=self.device.type == "cuda")
         self._fitted = self.cameras
@@ -107,7 +128,7 @@ class NGDModule(LightningModule):
             self._renderer,
             self._batches,
             self.optimizers().optimizer,
-            self.settings.rays,
+            max(1, round(self.settings.rays_share * self.settings.rays)),
             [generator(self.device, *seed, "rays") for seed in self.seeds],
             self.settings.cuda_graphs,
             FitLoss(self.objective, self.device),
@@ -115,37 +136,43 @@ class NGDModule(LightningModule):
         )
 
     def on_train_batch_start(self, step: int, batch_idx: int) -> int | None:
-        """End the run (-1) when every scene's parameters are non-finite."""
+        """End the run (-1) when every scene's parameters are non-finite, or at the end of the course."""
         self._alive = self._finite_on_host.tolist()
-        return None if any(self._alive) else -1
+        work = self.cameras.shape[1], self.settings.inner_steps
+        affordable = None if self._keeper is None else self._keeper.affordable(self.course.taken, *work)
+        return None if any(self._alive) and self.course.begin_step(affordable) else -1
 
     def training_step(self, step: int, batch_idx: int) -> None:
-        self._choose_views(step)
-        # render the field, for the teachers to guide by
-        with timed("guide"):
-            rendered = self._render_guidance() if self.teachers[0].follows_field else None
-        # ask the teachers for targets: the guided, denoised images
-        made = [
-            teacher.targets(step, None if rendered is None else rendered[scene])
-            if self._alive[scene]
-            else self._last_targets[scene]  # a scene that failed asks its teacher no more
-            for scene, teacher in enumerate(self.teachers)
-        ]
+        place = self.course.position
+        self._choose_views(place)
+        with self._measured("ask", self.cameras.shape[1]):
+            # render the field, for the teachers to guide by
+            with timed("guide"):
+                rendered = self._render_guidance() if self.teachers[0].follows_field else None
+            # ask the teachers for targets: the guided, denoised images
+            made = [
+                teacher.targets(place, None if rendered is None else rendered[scene])
+                if self._alive[scene]
+                else self._last_targets[scene]  # a scene that failed asks its teacher no more
+                for scene, teacher in enumerate(self.teachers)
+            ]
         stays = any(images is None for images in made)  # for all scenes alike
         targets = rendered if stays else torch.stack(made)
         # fit the field to them
-        self._set_rates(DECAYS[self.settings.lr_decay](step / self.steps))
+        self._set_rates(DECAYS[self.settings.lr_decay](place / self.steps))
         if stays:
             losses = targets.new_zeros(0, len(targets))
         else:
-            self._weigh_views()
-            losses = self._fit(targets)
+            self._weigh(rendered, targets)
+            with self._measured("fit", self.settings.inner_steps):
+                losses = self._fit(targets)
         # record, and keep the last finite field
         first, last = (losses[0], losses[-1]) if len(losses) else (None, None)
         distance = first if rendered is None else _mse(self._chosen_of(rendered), self._chosen_of(targets))
         one = self.teachers[self._alive.index(True)]
         self._records.append((one.t, one.weight, first, last, distance))
         self._keep_finite(losses, targets)
+        self.course.end_step(self._is_enough(one))
 
     def on_train_end(self) -> None:
         """Restore each scene's last finite field, or, where the fit made it worse, the field it began as.
@@ -157,22 +184,24 @@ class NGDModule(LightningModule):
         the field astray, the input view by more than `source_tolerance`. This holds for a last finite field too.
         """
         self.field.restore(self._good, ~self._finite)
-        if self._average is not None:
+        if self._average is not None and self._average.started:
             self.field.restore(self._average.snapshot(), self._finite)
         worse = torch.zeros_like(self._finite)
-        if self.settings.inner_steps > 0:
-            refined, after = self._distances(), self.field.snapshot()
-            self.field.restore(self._start, ~worse)
-            tolerances = self.settings.target_tolerance, self.settings.source_tolerance
-            of_targets, of_source = (
-                10 ** (dB / 10) * first + 1e-6 for dB, first in zip(tolerances, self._distances(), strict=True)
-            )
-            worse = ~((refined[0] <= of_targets) & (refined[1] <= of_source))
-            self.field.restore(after, ~worse)
+        if self.settings.inner_steps > 0 and self.course.taken > 0:
+            with self._measured("end", self.cameras.shape[1]):
+                views = self._render(self._chosen_of(self.cameras), self._renderer).images
+                source = self._render_source()
+            first, targets = self._chosen_of(self._first), self._chosen_of(self._last_targets)
+            for dB, now, before, truth in (
+                (self.settings.target_tolerance, views, first, targets),
+                (self.settings.source_tolerance, source, self._first_source, self._source),
+            ):
+                worse |= ~(_mse(now, truth) <= 10 ** (dB / 10) * _mse(before, truth) + 1e-6)
+            self.field.restore(self._start, worse)
         for scene, (finite, diverged) in enumerate(zip(self._finite.tolist(), worse.tolist(), strict=True)):
             self.statuses[scene] = "non-finite" if not finite else "diverged" if diverged else "ok"
         # module and Trainer hold each other: free the largest tensors now
-        del self._inner, self._batches, self._rendered
+        del self._inner, self._batches, self._rendered, self._first, self._first_source
 
     def trace(self, scene: int) -> list[Step]:
         """Return one scene's record, step by step. Waits for the device."""
@@ -190,21 +219,33 @@ class NGDModule(LightningModule):
         t, *_, distance = self._records[-1]
         return t, None if distance is None else float(psnr_of_mse(distance.nanmean()))
 
-    def _choose_views(self, step: int) -> None:
+    def _is_enough(self, teacher: Teacher) -> bool:
+        """Return true if the field's renderings agree no better with the denoised images. Waits for the device."""
+        if self._plateau is None or teacher.gap is None:
+            return False
+        return self._plateau(float(psnr_of_mse(teacher.gap)))
+
+    def _measured(self, piece: str, count: int) -> AbstractContextManager:
+        return nullcontext() if self._keeper is None else self._keeper.measure(piece, count)
+
+    def _choose_views(self, place: float) -> None:
         """Choose the views of a step, for denoising and fitting alike, and begin to average where it is time."""
         for views in self.views:
-            views.choose(step, self.steps)
+            views.choose(place, self.steps)
+            views.until = self.course.until
         chosen = [views.chosen for views in self.views]
         self._chosen = None if chosen[0] is None else torch.stack(chosen)
         if self._chosen is not None:
-            self._rendered = None  # of other views
+            begun = place == 0 and self._rendered is not None
+            self._rendered = self._of_all_views(self._chosen_of(self._rendered)) if begun else None  # of other views
         fitted = self._chosen
         if fitted is not None and self.settings.fit_source:  # it comes after the virtual views
             source = torch.full_like(fitted[:, :1], self.cameras.shape[1])
             fitted = torch.cat([fitted, source], 1)
         self._chosen_to_fit = fitted
         self._batches.set_views(fitted)
-        if self._average is not None and step >= min(self.steps - 1, self.steps * (1 - self.settings.average)):
+        is_last = self.course.until >= self.steps
+        if self._average is not None and (is_last or place >= self.steps * (1 - self.settings.average)):
             self._average.start()
 
     def _chosen_of(self, values, fitted: bool = False):
@@ -222,15 +263,36 @@ class NGDModule(LightningModule):
             return chosen
         return with_views(chosen.new_zeros(*self.cameras.shape, *chosen.shape[2:]), self._chosen, chosen)
 
-    def _weigh_views(self) -> None:
-        """Set how much views weigh, where a teacher says so; the input view weighs 1."""
-        if self.teachers[0].view_weights is None:
+    def _weigh(self, rendered: SceneImages | None, targets: SceneImages) -> None:
+        """Set how much rays weigh where a teacher says so of views, and how often they are drawn where errors say so.
+
+        The input view weighs 1, and its rays are drawn as often as if all were alike.
+        """
+        weights, of_views = targets.new_ones(targets.shape[:2])[..., None, None], self.teachers[0].view_weights
+        if of_views is not None:
+            weights = torch.stack([teacher.view_weights for teacher in self.teachers])[..., None, None]
+        by_error = self.settings.error_rays if rendered is not None else 0
+        shares = self._error_shares(rendered, targets, by_error) if by_error else torch.ones_like(weights)
+        if of_views is None and not by_error:
             return
-        weights = torch.stack([teacher.view_weights for teacher in self.teachers])
+        of_all = (weights / shares.clamp_min(1e-8)).expand(*targets.shape[:2], *targets.shape[-2:])
         if self.settings.fit_source:
-            weights = torch.cat([weights, torch.ones_like(weights[:, :1])], 1)
-        size = self._source.shape[-2:]
-        self._batches.set_weights(weights[..., None, None].expand(*weights.shape, *size))
+            source = torch.ones_like(of_all[:, :1])
+            of_all, shares = torch.cat([of_all, source], 1), torch.cat([shares.expand_as(of_all), source], 1)
+        self._batches.set_weights(of_all)
+        if by_error:
+            self._batches.set_shares(shares)
+
+    def _error_shares(
+        self, rendered: SceneImages, targets: SceneImages, by_error: float
+    ) -> Float[Tensor, "scenes views height width"]:
+        """Return how often rays of the chosen views are drawn, 1 on average; a pixel's neighbours count as it does."""
+        errors = (targets - rendered).square().mean(2).sqrt()
+        errors = F.avg_pool2d(errors, 3, 1, 1, count_include_pad=False)
+        chosen = self._of_all_views(self._chosen_of(torch.ones_like(errors)))  # targets of the others are no news
+        mean = ((errors * chosen).flatten(1).sum(1) / chosen.flatten(1).sum(1))[:, None, None, None]
+        relative = torch.where(mean > 0, errors / mean, 1.0)  # where there is no error all rays are alike
+        return chosen * (1 - by_error + by_error * relative)
 
     @timed("fit")
     def _fit(self, targets: SceneImages) -> Float[Tensor, "steps scenes"]:
@@ -288,11 +350,8 @@ class NGDModule(LightningModule):
             views.field_queries += renderer.samples_per_ray * rendering.opacity[0].numel()
         return rendering
 
-    def _distances(self) -> tuple[Float[Tensor, "scenes"], Float[Tensor, "scenes"]]:
-        """Return the mean squared errors of the last targets and of the input view."""
-        source = self._render(self.field.cameras[:, None], self._renderer).images
-        views = self._render(self._chosen_of(self.cameras), self._renderer).images
-        return _mse(views, self._chosen_of(self._last_targets)), _mse(source[:, 0], self._source)
+    def _render_source(self) -> Float[Tensor, "scenes 3 height width"]:
+        return self._render(self.field.cameras[:, None], self._renderer).images[:, 0]
 
 
 def _mse(images: Float[Tensor, "scenes *rest"], others: Float[Tensor, "scenes *rest"]) -> Float[Tensor, "scenes"]:

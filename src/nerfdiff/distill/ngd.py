@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfdiff.diffusion.sampler import SamplerSettings
+from nerfdiff.diffusion.sampler import SamplerSettings, time_at
 from nerfdiff.diffusion.schedule import add_noise, alpha_sigma
 from nerfdiff.distill.autoguidance import Autoguidance
 from nerfdiff.distill.teacher import uses_current_rendering
@@ -138,21 +138,26 @@ class NGDTeacher:
         self.times = self._host_times.to(views.encoding.source.device)
         self.t: float | None = None
         self.weight: float | None = None
+        self.gap: Float[Tensor, ""] | None = None
         self._last = to_signed(views.first_renderings)
         # Algorithm 1 begins with the renderings, noised: for t_max = 1 that is noise alone
         self._z = add_noise(self._last, views.noise(), *alpha_sigma(self.times[0]))
 
-    def targets(self, step: int, rendered: Images) -> Images | None:
-        t, t_next = self.times[step], self.times[step + 1]
-        recorded = self._host_times[step]
+    def targets(self, step: float | int, rendered: Images) -> Images | None:
+        until = step + 1 if self.views.until is None else self.views.until
+        t, t_next = time_at(self.times, step), time_at(self.times, until)
+        recorded = time_at(self._host_times, step)
         self.t, self.weight = float(recorded), float(self.guidance.weight(recorded))
         replaced = self.guidance.replaces(recorded)
         if replaced and self.at_full_guidance != "everything":
-            self._last = to_signed(rendered).clamp(-1, 1)
+            self._last, self.gap = to_signed(rendered).clamp(-1, 1), None
         else:
             # denoise
             condition = rendered if self.on_current else None
             x0 = self.views.denoise(self._z, t.expand(len(self._z)), condition, self._deep)
+            # compared with the last images, guided ones overshoot by w: a schedule must not end where w is large
+            is_blend = self.guidance.compare == "current"
+            self.gap = self.views.distance(to_unit(x0), rendered) if is_blend else None
             # guide
             self._last = self.guidance(x0, to_signed(rendered), self._last, t)
         # step to the next time

@@ -31,7 +31,7 @@ class SDSTeacher:
         ConfigError: another `condition` or `weighting`, or times, steps or views that cannot be.
     """
 
-    t = weight = None
+    t = weight = gap = None
     follows_field = True
 
     def __init__(
@@ -59,7 +59,7 @@ class SDSTeacher:
             self.steps = -(-steps * len(views) // at_once)
             views.choose_randomly(at_once, self.steps)
 
-    def targets(self, step: int, rendered: Images) -> Images:
+    def targets(self, step: float | int, rendered: Images) -> Images:
         t = self.t_min + (self.t_max - self.t_min) * self.views.uniform()
         alpha, sigma = alpha_sigma(t)
         self.view_weights = 2 * alpha * sigma if self.weighting == "sigma2" else None

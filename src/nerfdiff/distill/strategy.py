@@ -30,6 +30,8 @@ class PredictedViews:
         denoiser_calls: images passed through the CDM.
         field_queries: points at which a field was evaluated.
         virtual_views: K, how many views a field was fitted to, where it was.
+        steps, steps_planned: of the teacher, that were taken, and that the budget has.
+        stopped_by: why they ended: `schedule`, all were taken; or `agreement` or `deadline`, something was left out.
         field: the field that the images are rendered from, where the method has one.
         trace: of its fitting, where it was fitted.
         status: `ok`, or why the field is not the one that the method ended with.
@@ -41,6 +43,9 @@ class PredictedViews:
     denoiser_calls: int = 0
     field_queries: int = 0
     virtual_views: int | None = None
+    steps: int | None = None
+    steps_planned: int | None = None
+    stopped_by: str | None = None
     field: SavedField | None = None
     trace: Sequence[Step] = ()
     status: str = "ok"

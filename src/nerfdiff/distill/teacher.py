@@ -15,7 +15,7 @@ class Teacher(Protocol):
     """Give target images of all virtual views, step by step."""
 
     steps: int
-    """Number of times targets are asked for."""
+    """Length of the schedule: the number of times targets are asked for, where time is not short."""
 
     follows_field: bool
     """True if targets depend on the field's renderings, which are made for that only."""
@@ -29,11 +29,16 @@ class Teacher(Protocol):
     view_weights: Float[Tensor, "views"] | None
     """Weights of the views' losses at the last step; None weighs all the same."""
 
-    def targets(self, step: int, rendered: Images | None) -> Images | None:
+    gap: Float[Tensor, ""] | None
+    """Mean squared error of the renderings against the denoised images at the last step; None where they were not
+    compared."""
+
+    def targets(self, step: float | int, rendered: Images | None) -> Images | None:
         """Return images in [0, 1] to fit the field to; None where it stays as it is, its renderings being the targets.
 
         Args:
-            step: from 0 to `steps` - 1, each once, in order.
+            step: place on the schedule, from 0 to less than `steps`, growing. A step is 1 long, or as the virtual views
+                say (`VirtualViews.until`).
             rendered: the field's images of the chosen views now, in [0, 1], and zeros for the others
                 (`VirtualViews.chosen`); None where the teacher does not follow the field.
         """

@@ -31,9 +31,14 @@ class VirtualViews:
         seed: of all noise; a view's noise depends on it and on the view's number alone.
         last: number of views that are left at the last step, see `choose`; None: all.
 
+    `until` is where the step in hand ends on the schedule; None: 1 further on.
+
     Raises:
         ConfigError: no views.
     """
+
+    until: float | None = None
+    chosen: Tensor | None = None
 
     @torch.no_grad()
     def __init__(
@@ -58,7 +63,6 @@ class VirtualViews:
         self._condition = model.condition(encoding, cameras, torch.cat(rendered, 1))
         self._noise = [generator(encoding.source.device, *seed, view) for view in range(len(self))]
         self._weak: tuple[Autoguidance, Denoiser, Condition] | None = None
-        self.chosen: Tensor | None = None
         self._last = min(last or len(self), len(self))
         self._order = None if self._last == len(self) else farthest_first(cameras.centres[0])
         self._table: Tensor | None = None
@@ -76,17 +80,17 @@ class VirtualViews:
         """Images of all views by the single-image NeRF, in [0, 1]."""
         return self._condition.rendered
 
-    def choose(self, step: int, steps: int) -> None:
-        """Choose the views that step number `step` of `steps` denoises and fits: `chosen`, None for all.
+    def choose(self, step: float | int, steps: int) -> None:
+        """Choose the views that are denoised and fitted at a place on a schedule of `steps`: `chosen`, None for all.
 
         Their number falls evenly from all at the first step to `last` at the last. Those that are kept are spread out:
         in turn the one farthest from those kept already. Views that were dropped do not come back. After
         `choose_randomly`, each step has its own.
         """
         if self._table is not None:
-            self.chosen = self._table[step]
+            self.chosen = self._table[int(step)]
         elif self._order is not None:
-            left = round(len(self) + (self._last - len(self)) * step / max(1, steps - 1))
+            left = round(len(self) + (self._last - len(self)) * min(1, step / max(1, steps - 1)))
             self.chosen = self._order[:left].sort().values
 
     def choose_randomly(self, views: int, steps: int) -> None:
@@ -164,6 +168,11 @@ class VirtualViews:
         parts = self._parts(len(z))
         deep = [None] * len(parts) if deep is None else deep
         return torch.cat([denoiser(z[p], t[p], condition[p], kept) for p, kept in zip(parts, deep, strict=True)])
+
+    def distance(self, images: Images, others: Images) -> Float[Tensor, ""]:
+        """Return the mean squared error of the chosen views' images."""
+        chosen = slice(None) if self.chosen is None else self.chosen
+        return (images[chosen] - others[chosen]).square().mean()
 
     def noise(self) -> Images:
         """Draw standard normal images, each from its own view's stream."""

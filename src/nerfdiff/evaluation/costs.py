@@ -3,7 +3,7 @@
 import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from statistics import fmean
+from statistics import fmean, median
 from typing import Any
 
 import torch
@@ -39,6 +39,7 @@ def cost_fields(run: EvaluationRun, strategy: Strategy) -> dict[str, Any]:
     alike = [cost for cost in scenes if cost["conditions"] == run.cost_key]
     fields["scene_s"] = _timing(alike, "seconds")
     fields |= {f"{name}_s": _timing(alike, name) for name in ("encode", "render")}
+    fields |= _spent(scenes)
     if fields["denoiser_calls"]:
         fields |= {f"{name}_s": _timing(alike, name) for name in ("distill", *PARTS)}
     fields["timing_s"] = cost_of_a_piece(run.device) * fmean(cost["pieces"] for cost in scenes)
@@ -53,6 +54,17 @@ def cost_fields(run: EvaluationRun, strategy: Strategy) -> dict[str, Any]:
     if fallen:
         fields["error"] = "fell back: " + ", ".join(f"{count} scenes {status}" for status, count in fallen.items())
     return fields | {"fallbacks": fallen.total()}
+
+
+def _spent(scenes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return medians of what scenes took, and why they ended; a run may go on from one that did not write it down."""
+    fields: dict[str, Any] = {}
+    for name in ("denoiser_calls", "field_queries", "steps"):
+        if counts := [cost[name] for cost in scenes if cost.get(name) is not None]:
+            fields[f"{name}_median"] = float(median(counts))
+    fields["steps_planned"] = max((cost["steps_planned"] for cost in scenes if cost.get("steps_planned")), default=None)
+    reasons = Counter(cost["stopped_by"] for cost in scenes if cost.get("stopped_by"))
+    return fields | {"stopped_by": ", ".join(f"{why} {count}" for why, count in reasons.most_common()) or None}
 
 
 def _verdict(scenes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -145,7 +145,7 @@ def _write(
             "peak_mem_bytes": _peak_memory(run.device),
             "denoiser_calls": views.denoiser_calls,
             "field_queries": views.field_queries,
-            "virtual_views": views.virtual_views,
+            **{name: getattr(views, name) for name in ("virtual_views", "steps", "steps_planned", "stopped_by")},
         },
         status=views.status,
         verdict=verdict,

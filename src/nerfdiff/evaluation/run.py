@@ -320,6 +320,8 @@ def _run(
         | (stress.identity if stress is not None else {})
         | ({"mend": mend.identity} if mend is not None else {})
     )
+    if cfg.seconds_per_scene is not None and "seconds" not in cfg.strategy:
+        log.warning("seconds_per_scene acts on strategies that fit a field: %s takes its time", cfg.strategy.name)
     folder = Path(cfg.paths.output_dir) / f"{cfg.strategy.name}-{sha256_values(identity)[:8]}"
     model = loaded.model.to(device).requires_grad_(False)
     in_pixels = channels_last(cfg.channels_last, device, cfg.compile != "none")

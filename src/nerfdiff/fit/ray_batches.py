@@ -29,6 +29,7 @@ class RayBatches:
         self._table = table.reshape(scenes * per_scene, -1)
         self._coarse: Float[Tensor, "rays bins"] | None = None
         self._weights: Tensor | None = None  # of each ray
+        self._upto: Float[Tensor, "scenes rays"] | None = None  # shares of the rays before each, and its own
         self._first = per_scene * torch.arange(scenes, device=near.device)[:, None]
 
     def set_colours(self, images: Float[Tensor, "scenes views 3 height width"]) -> None:
@@ -38,6 +39,11 @@ class RayBatches:
     def set_weights(self, weights: Float[Tensor, "scenes views height width"]) -> None:
         """Set how much the rays weigh in the loss."""
         self._weights = _kept(self._weights, weights.reshape(-1))
+
+    def set_shares(self, shares: Float[Tensor, "scenes views height width"]) -> None:
+        """Set in which proportion `draw` draws the rays of all views."""
+        # in double: float32 has too few digits for the sum of millions
+        self._upto = shares.flatten(1).double().cumsum(1)
 
     def set_coarse(self, coarse: Float[Tensor, "scenes views height width bins"]) -> None:
         """Keep the coarse weights of the chosen views' rays (`Rendering.coarse`), for `coarse_at` to return."""
@@ -65,6 +71,11 @@ class RayBatches:
         Returns:
             the numbers of their rays within their scenes, patch by patch, row by row.
         """
+        if self._upto is not None:
+            for own, upto, source in zip(patches, self._upto, generators, strict=True):
+                places = torch.rand(own.shape, generator=source, device=own.device, dtype=torch.float64) * upto[-1]
+                own.copy_(torch.searchsorted(upto, places, right=True).clamp_max(len(upto) - 1))
+            return patches
         height, width = self._size
         rows, columns = height - side + 1, width - side + 1
         views = self.shape[1] // (height * width) if self._views is None else self._views.shape[1]

@@ -38,11 +38,18 @@ class FitSettings:
             None, or more than the model has: the model's.
         average: share of the teacher's steps, up to the last, over whose inner steps planes and decoder are averaged;
             the mean is kept. 0 keeps what the last step left.
+        error_rays: share of the rays that are drawn where the last renderings differ from the targets, in proportion to
+            how much; each weighs as much less as it is drawn more often. 0 draws all alike.
+        rays_share: of B, that are drawn.
+        steps_share: of the teacher's steps, that are taken, each longer.
+        patience: steps in which the field's renderings agree no better with the denoised images, after which what is
+            left of the schedule is one step; None: all steps are taken.
+        rise: dB by which they have to agree better.
         views_last: number of virtual views that are left at the last step, see `VirtualViews.choose`; None keeps all.
 
     Raises:
-        ConfigError: another `lr_decay` or `coarse`, no rays, negative steps, an `average` outside [0, 1], or no
-            view or uniform samples.
+        ConfigError: another `lr_decay` or `coarse`, no rays, negative steps, shares outside [0, 1], or no view or
+            uniform samples.
     """
 
     inner_steps: int
@@ -59,6 +66,11 @@ class FitSettings:
     guidance_importance_samples: int | None = None
     average: float = 0.0
     views_last: int | None = None
+    error_rays: float = 0.0
+    rays_share: float = 1.0
+    steps_share: float = 1.0
+    patience: int | None = None
+    rise: float = 0.0
 
     def __post_init__(self):
         if self.rays < 1 or self.inner_steps < 0:
@@ -69,6 +81,13 @@ class FitSettings:
             raise ConfigError(f"strategy.coarse={self.coarse!r}: choose {', '.join(COARSE)}")
         if not 0 <= self.average <= 1:
             raise ConfigError(f"strategy.average={self.average}: expected a share of the steps, from 0 to 1")
+        if not 0 <= self.error_rays < 1:
+            raise ConfigError(f"strategy.error_rays={self.error_rays}: expected a share of rays from 0 to less than 1")
+        for name in ("rays_share", "steps_share"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ConfigError(f"strategy.{name}={getattr(self, name)}: expected a share above 0, to 1")
+        if self.patience is not None and self.patience < 1:
+            raise ConfigError(f"strategy.patience={self.patience} must be at least 1; null takes all steps")
         if self.views_last is not None and self.views_last < 1:
             raise ConfigError(f"strategy.views_last={self.views_last} must be at least 1; null keeps all views")
         for name, least in (("uniform", 1), ("importance", 0)):

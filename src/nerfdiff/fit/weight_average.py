@@ -17,10 +17,12 @@ class WeightAverage:
         self._values = dict(field.named_parameters())
         self._means = field.snapshot()
         device = field.planes.device
+        self.started = False
         self._on, self._count = torch.zeros((), device=device), torch.zeros((), device=device)
 
     def start(self) -> None:
         """Average from the next `update` on."""
+        self.started = True
         self._on.fill_(1)
 
     @torch.no_grad()

@@ -20,7 +20,7 @@ from nerfdiff.metrics.consistency import Consistency
 from nerfdiff.metrics.perceptual import LPIPS, LPIPS_NET, LPIPS_VGG, STLPIPS
 from nerfdiff.metrics.predictions import SCENE, Prediction, read_plan, read_prediction
 from nerfdiff.metrics.sets import FrechetDistance, InceptionFeatures, inception_weights
-from nerfdiff.metrics.summary import FACTS, SceneScores, Value, summarise, write_csv
+from nerfdiff.metrics.summary import FACTS, SPENT, SceneScores, Value, summarise, write_csv
 from nerfdiff.metrics.table import METRICS, PACKAGE, named
 from nerfdiff.metrics.table import own as own_metrics
 from nerfdiff.metrics.whole_scene import Geometry, WholeScene
@@ -137,7 +137,7 @@ class Scorer:
         rows = [row for scene in scenes for row in scene.image_rows()]
         write_csv(out / "per_image.csv", ("scene", "view", *named("image")), rows)
         per_scene = [scene.row() for scene in scenes]
-        write_csv(out / "per_scene.csv", (*FACTS, *named("image", "scene")), per_scene)
+        write_csv(out / "per_scene.csv", (*FACTS, *SPENT, *named("image", "scene")), per_scene)
         write_text(out / "summary.json", json.dumps(encode(summary), indent=1, allow_nan=False) + "\n")
         return summary
 
@@ -181,7 +181,8 @@ class _Session:
                 folder / scene_id / FIELD,
                 self.device,
             )
-        return SceneScores(scene_id, prediction.views, blank, values, whole, prediction.status, prediction.verdict)
+        said = prediction.status, prediction.verdict, prediction.cost
+        return SceneScores(scene_id, prediction.views, blank, values, whole, *said)
 
     def _batch(
         self, pixels: UInt8[Tensor, "n 3 h w"], true_pixels: UInt8[Tensor, "n 3 h w"]

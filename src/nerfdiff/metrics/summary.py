@@ -11,7 +11,7 @@ from nerfdiff.metrics.table import METRICS, PACKAGE, named
 from nerfdiff.utils.errors import DataError
 from nerfdiff.utils.files import atomic
 
-FACTS = ("scene", "views", "status", "verdict", "blank")  # of a scene, beside its metrics
+FACTS = ("scene", "views", "status", "verdict", "blank", "stopped_by")  # of a scene, beside its metrics
 SPENT = ("distill", "denoiser_calls", "field_queries", "steps")  # on a scene: seconds and counts
 LARGEST = 2**21  # bytes of a file of scores: of some 10,000 scenes
 
@@ -28,6 +28,7 @@ class SceneScores:
         whole: those of whole scenes that were measured.
         status: `ok`, or why the method fell back to something else.
         verdict: of the judge.
+        cost: what was spent, and why no more, as `PredictionWriter` has it.
     """
 
     scene_id: str
@@ -37,6 +38,7 @@ class SceneScores:
     whole: Mapping[str, float | None] = field(default_factory=dict)
     status: str = "ok"
     verdict: str | None = None
+    cost: Mapping[str, Value] = field(default_factory=dict)
 
     def mean(self, metric: str) -> float | None:
         return self.whole.get(metric) if METRICS[metric].per == "scene" else _mean(self.values.get(metric, ()))
@@ -49,8 +51,10 @@ class SceneScores:
         return rows
 
     def row(self) -> dict[str, Value]:
-        facts = (self.scene_id, len(self.views), self.status, self.verdict, int(self.blank))
-        return dict(zip(FACTS, facts, strict=True)) | {m: self.mean(m) for m in named("image", "scene")}
+        stopped_by = self.cost.get("stopped_by")
+        facts = (self.scene_id, len(self.views), self.status, self.verdict, int(self.blank), stopped_by)
+        spent = {name: self.cost.get(name) for name in SPENT}
+        return dict(zip(FACTS, facts, strict=True)) | spent | {m: self.mean(m) for m in named("image", "scene")}
 
 
 def summarise(scenes: Sequence[SceneScores]) -> dict[str, Value]:
@@ -99,17 +103,26 @@ def read_scores(path: Path) -> dict[str, dict[str, float]]:
     Raises:
         DataError: the file is missing or damaged.
     """
+    return {
+        scene: {name: float(cell) for name, cell in line.items() if name not in (*FACTS, *SPENT)}
+        for scene, line in read_cells(path).items()
+    }
+
+
+def read_cells(path: Path) -> dict[str, dict[str, str]]:
+    """Read the cells of each scene that are not empty, by column; those beside `FACTS` are numbers.
+
+    Raises:
+        DataError: the file is missing or damaged.
+    """
     try:
         if (size := path.stat().st_size) > LARGEST or not path.is_file():
             raise ValueError(f"{size} bytes are too many" if path.is_file() else "no file")
         with open(path, newline="", encoding="utf-8") as file:
-            return {
-                line["scene"]: {
-                    name: float(cell)
-                    for name, cell in line.items()
-                    if name not in (*FACTS, *SPENT, "stopped_by") and cell
-                }
-                for line in csv.DictReader(file)
-            }
+            found = {line["scene"]: {k: cell for k, cell in line.items() if cell} for line in csv.DictReader(file)}
+        for line in found.values():
+            for name in line.keys() - set(FACTS):
+                float(line[name])
+        return found
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
         raise DataError(f"{path}: cannot be read ({error})") from error

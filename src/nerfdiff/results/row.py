@@ -97,7 +97,9 @@ class ResultRow(make_dataclass("_Measured", _NUMBERS, bases=(_Identity,), kw_onl
     earlier jobs of a sweep left in it. `backend` is what rendered: `triton`, `torch`, or `cpu`, which is PyTorch in the
     order that suits a CPU. `samples_per_ray` counts coarse and fine ones. `K` counts the virtual views that fields were
     fitted to, the most of any scene. `fid_n` is the number of images on either side of `fid` and `fd_st_vgg`; `n_views`
-    counts all scored images; `consistency_n` scenes were measured for consistency. `fallbacks` counts the scenes whose
+    counts all scored images; `consistency_n` scenes were measured for consistency. Scenes' counts have medians, too:
+    `steps_median` is how many steps the teacher took, of `steps_planned`; `stopped_by` counts why scenes ended: by
+    their `schedule`, all of it done; by `agreement` or a `deadline`, with less. `fallbacks` counts the scenes whose
     distillation failed and which kept an earlier field; `error` says how; where all did, the status is `diverged`.
     `suspects` counts the scenes that the judge suspects, and `verdict` is `ok`, or says of how many what it suspects.
     The last three are of the training run that made the checkpoint.
@@ -121,6 +123,11 @@ class ResultRow(make_dataclass("_Measured", _NUMBERS, bases=(_Identity,), kw_onl
     timing_s: float | None = None
     denoiser_calls: int | None = None
     field_queries: int | None = None
+    denoiser_calls_median: float | None = None
+    field_queries_median: float | None = None
+    steps_median: float | None = None
+    steps_planned: int | None = None
+    stopped_by: str | None = None
     peak_mem_bytes: int | None = None
     params: int | None = None
     # environment

@@ -21,7 +21,7 @@ class AlienViews:
         """Whatever else a teacher is asked for is the teacher's own."""
         return getattr(self.teacher, name)
 
-    def targets(self, step: int, rendered: Images | None) -> Images:
+    def targets(self, step: float | int, rendered: Images | None) -> Images:
         own = self.teacher.targets(step, rendered)
         images = (rendered if own is None else own).clone()  # None: the field's renderings are the targets
         replaced = replaced_views(len(images), self.share)

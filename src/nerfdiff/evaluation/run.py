@@ -64,6 +64,7 @@ class RunSettings:
         minutes: after which no scene begins.
         progress_every: seconds between lines where there is no terminal.
         per_scene: leave every scene's field, trace and orbit beside its views.
+        keep_steps: how many fields from on the way of distillation are left beside each scene's.
         stress, severity, neutral: what goes wrong on purpose, by how much, and how much is nothing; None: nothing.
     """
 
@@ -77,6 +78,7 @@ class RunSettings:
     minutes: float | None
     progress_every: float | None
     per_scene: bool
+    keep_steps: int
     orbit: Orbit
     sheet: Sheet
     stress: str | None
@@ -86,7 +88,7 @@ class RunSettings:
     @staticmethod
     def of(cfg: DictConfig) -> "RunSettings":
         """Read the settings of a composed config."""
-        same = ("run_name", "seed", "scenes_at_once", "minutes", "progress_every", "per_scene")
+        same = ("run_name", "seed", "scenes_at_once", "minutes", "progress_every", "per_scene", "keep_steps")
         return RunSettings(
             **{name: cfg[name] for name in same},
             dataset=f"{cfg.data.name}/{cfg.data.test_split}",
@@ -288,6 +290,7 @@ def _run(
             "strategy": plain(cfg.strategy),
         }
         | (stress.identity if stress is not None else {})
+        | ({"keep_steps": cfg.keep_steps} if cfg.keep_steps else {})
     )
     folder = Path(cfg.paths.output_dir) / f"{cfg.strategy.name}-{sha256_values(identity)[:8]}"
     model = loaded.model.to(device).requires_grad_(False)

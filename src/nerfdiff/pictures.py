@@ -14,6 +14,7 @@ from nerfdiff.api import Model, Scene, load, load_scene
 from nerfdiff.cli import command_words
 from nerfdiff.data.cutout import Mask, write_mask
 from nerfdiff.data.picture import scene_id
+from nerfdiff.evaluation.dashboard import show_picture
 from nerfdiff.exports.export import FieldExport, check_formats
 from nerfdiff.exports.views import over, render_rgba
 from nerfdiff.fit.saved_field import FIELD, STEPS, save_steps
@@ -93,6 +94,8 @@ def _make(cfg: DictConfig, model: Model, image: Path, folder: Path) -> None:
     else:
         log.info("%s: the scene is there already, in %s", image, folder / FIELD)
     written = [_views(scene, batch.source[0].cpu(), folder / "views.png")]
+    facts = {"picture": str(image), "status": scene.status, "folder": str(folder)}
+    show_picture(cfg, Path(cfg.out), folder.name, facts, written[0])
     export = FieldExport.of(scene.saved, cfg)
     for kind in cfg.format:
         name = {"mp4": "orbit", "gif": "orbit", "html": "viewer"}.get(kind, folder.name)

@@ -257,7 +257,7 @@ def test_what_cannot_be_is_said(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=r"name a field: .*view.* field=out/car/field\.safetensors"):
         open_viewer(load_config("view", []))
     (tmp_path / "x.safetensors").write_text("no field")
-    with pytest.raises(DataError, match="x.safetensors: not a field"):
+    with pytest.raises(DataError, match=r"x\.safetensors: not a field"):
         open_viewer(load_config("view", [f"field={tmp_path / 'x.safetensors'}"]))
     for wrong in ("port=70000", "height=0", "frame_seconds=0"):
         with pytest.raises(ConfigError, match=wrong.partition("=")[0]):

@@ -122,7 +122,8 @@ class Dashboard:
 
     def _name(self, row: ResultRow) -> str:
         """Name a row's run by its strategy and what else its command set."""
-        given = tensorboard.overridden(row.overrides or (), [*self.ignored, "strategy"])
+        given = tensorboard.overridden(row.overrides or (), self.ignored)
+        given.pop("strategy", None)
         return ("failed/" if row.folder is None else "") + _called(row.strategy or "unknown", given)
 
 

@@ -1,4 +1,4 @@
-"""The Dockerfile, which no Docker has built here: what it copies is there and not ignored, what it makes are targets."""
+"""The Dockerfile, which no Docker has built here: what it copies is there, and what it makes are targets."""
 
 import json
 import re

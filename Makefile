@@ -17,7 +17,7 @@ CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 CPU_BUILD := $(shell sed -nE 's/^((torch|torchvision)==[^ ]+).*/\1+cpu/p' $(LOCK))
 GPU_ONLY := torch|torchvision|nvidia-.*|cuda-.*
 
-.PHONY: setup lock browser demo test faults lint dashboard docs clean
+.PHONY: setup lock browser demo test faults lint dashboard notebooks docs clean
 
 setup: $(VENV)/.installed
 
@@ -67,6 +67,10 @@ lint: setup
 dashboard: setup
 	( sleep 5; $(BIN)/python -m webbrowser 'http://localhost:6006/#custom_scalars' ) & \
 	$(BIN)/tensorboard --logdir $(LOGDIR) --port 6006 --samples_per_plugin images=100
+
+# Their outputs, which are committed: a quarter of an hour on two cores.
+notebooks: setup
+	$(BIN)/python notebooks/execute.py
 
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict --site-dir build/docs

@@ -14,7 +14,7 @@ LAYERS = (
     "cameras", "poses", "trajectories", "data",
     "diffusion", "field", "render", "model", "averages", "exported_model", "checkpoint", "compilation",
     "fit", "metrics", "results", "distill", "stress", "stability", "training",
-    "evaluation", "exports", "inspection", "chart", "sweeps", "demo", "api", "pictures", "commands",
+    "evaluation", "exports", "view", "inspection", "chart", "sweeps", "demo", "api", "pictures", "commands",
 )  # fmt: skip
 """Packages and modules of `nerfdiff`: each imports only from those before it. (`metrics` comes before `distill` and
 `training`, which log PSNR.)"""

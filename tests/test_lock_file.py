@@ -9,7 +9,7 @@ from packaging.utils import canonicalize_name
 from packaging.version import Version
 
 PROJECT = Path(__file__).parents[1]
-LOCKED = ("scenes", "chart", "mesh", "fid", "joblib", "submitit", "optuna", "all", "docs", "dev")
+LOCKED = ("scenes", "chart", "mesh", "view", "fid", "joblib", "submitit", "optuna", "all", "docs", "dev")
 """Extras that are part of dev, or dev."""
 ENTRY = r"[\w.-]+==[\w.]+( ; [^\\\n]+)?( \\\n    --hash=sha256:[0-9a-f]{64})+"
 

@@ -1,9 +1,13 @@
 """The notebook, run from its first cell to its last on a small budget."""
 
+import ast
 import re
+import warnings
 from pathlib import Path
 
 import nbformat
+import pandas as pd
+import pytest
 import torch
 from nbclient import NotebookClient
 
@@ -14,6 +18,19 @@ from nerfdiff.metrics.image import psnr
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 METHODS = ("single-image NeRF", "CDM", "refined field")
+FEW = ["budget.sampler_steps=2", "budget.inner_steps=1", "budget.rays=64", "budget.views=2"]
+TINY_MODEL = [
+    *("model.unet.channel_mult=[1,1]", "model.unet.attention_downsampling=[2]", "model.field.channels=4"),
+    *("model.render.uniform_samples=4", "model.render.importance_samples=4", "callbacks.previews.sampler.steps=2"),
+    *(
+        "data.batch_size=2",
+        "data.val_scenes=1",
+        "data.val_targets=1",
+        "trainer.max_steps=2",
+        "trainer.log_every_n_steps=1",
+    ),
+    "data.cache=false",
+]
 SMALL = """
 out = {out!r}
 strategy = ["strategy=ngd_current", "strategy.lr_planes=1.0e-2"]
@@ -50,8 +67,63 @@ def test_from_picture_to_field(tmp_path):
     assert shown == len(list((tmp_path / "out").glob("*.png"))) == 7
 
 
-def test_notebooks_are_stored_without_outputs():
-    for path in sorted(NOTEBOOKS.glob("*.ipynb")):
-        cells = nbformat.read(path, as_version=4).cells
-        stored = [cell for cell in cells if cell.cell_type == "code" and (cell.outputs or cell.execution_count)]
-        assert not stored, f"{path} has outputs: jupyter nbconvert --clear-output --inplace {path}"
+TINY = {
+    "train_in_five_minutes": ("scenes = 1", "minutes = 2 / 60", "validation_every = 1", f"small = {TINY_MODEL!r}"),
+    "your_own_dataset": ("views = 6", f"strategy = {['strategy=none', *FEW]!r}"),
+    "compare_strategies": ("strategies = ['none', 'cdm']", f"budget = {['budget.steps=2', *FEW]!r}"),
+    "read_a_sweep": (f"results = {str(NOTEBOOKS.parent / 'docs' / 'speed_accuracy')!r}",),
+    "where_it_fails": (f"strategy = {['strategy=none', *FEW]!r}",),
+}
+"""Parameters, beside `out`, with which the other notebooks take seconds."""
+
+
+@pytest.mark.parametrize("name", TINY)
+def test_other_notebooks_run_from_first_to_last(name, tmp_path, monkeypatch, capsys):
+    """In this process: a kernel for each would import everything anew."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TQDM_DISABLE", "1")
+    cells = [
+        cell for cell in nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4).cells if cell.cell_type == "code"
+    ]
+    (parameters,) = (cell for cell in cells if "parameters" in cell.metadata.get("tags", []))
+    given = [*TINY[name], *(["out = 'out'"] if "out =" in parameters.source else [])]
+    settable = set(re.findall(r"^(\w+) =", parameters.source, re.M))
+    assert settable == {line.partition(" =")[0] for line in given}
+    shown: list[object] = []
+    monkeypatch.setattr("IPython.display.display", lambda *what, **_: shown.extend(what))
+    monkeypatch.setattr("matplotlib.pyplot.show", lambda: shown.append("figure"))
+    space: dict[str, object] = {"__name__": "notebook"}
+    with warnings.catch_warnings():
+        for cell in cells:
+            source = "\n".join(given) if cell is parameters else cell.source
+            *statements, last = ast.parse(source).body
+            if isinstance(last, ast.Expr):  # a notebook shows the value of a cell's last line
+                exec(compile(ast.Module(statements, []), name, "exec"), space)
+                value = eval(compile(ast.Expression(last.value), name, "eval"), space)
+                shown += [] if value is None else [value]
+            else:
+                exec(compile(source, name, "exec"), space)
+    assert len(shown) >= 2 and all(len(frame) > 1 for frame in shown if isinstance(frame, pd.DataFrame))
+    said = capsys.readouterr().out
+    if name == "your_own_dataset":
+        assert "error: " in said and "no train split" not in said  # the wrong axes are found
+    if name == "where_it_fails":
+        assert set(space["verdicts"]) == {"car", "elevation", "half", "chair"}
+
+
+NOT_YET = {"one_picture", "train_in_five_minutes"}
+"""Still stored without outputs: `make notebooks` makes them, and then they leave this set."""
+
+
+@pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem)
+def test_notebooks_are_stored_with_outputs_of_their_own_source(path):
+    cells = [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+    assert path.stat().st_size < 400_000
+    if path.stem in NOT_YET:
+        assert not any(cell.outputs for cell in cells), f"{path.stem} has outputs: take it out of NOT_YET"
+        return
+    assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1)), "make notebooks"
+    outputs = [output for cell in cells for output in cell.outputs]
+    assert not [output for output in outputs if output.output_type == "error"]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    assert str(Path.home()) not in path.read_text() and "/wt/" not in path.read_text()

@@ -69,7 +69,8 @@ def test_a_picture_that_fails_leaves_the_others(tmp_path, caplog):
     with pytest.raises(DataError, match="1 of 2 pictures failed"):
         made(tmp_path, f"images=['{tmp_path / 'grey.png'}','{wagon}']", "strategy=none", "format=[gif]")
     assert "grey.png: no object stands out" in caplog.text
-    (folder,) = (tmp_path / "out").iterdir()
+    folder, shown = sorted((tmp_path / "out").iterdir(), reverse=True)
+    assert list(shown.glob("picture/wagon strategy=none/events.*")) and shown.name == "tensorboard"
     assert {path.name for path in folder.iterdir()} == {"field.safetensors", "scene.json", "views.png", "orbit.gif"}
     assert folder.name == "wagon" and "wagon.png: its background" not in caplog.text
 

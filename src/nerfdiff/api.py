@@ -11,8 +11,8 @@ Nothing is written but what is asked for. The settings are those of `conf/pictur
 
 import copy
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from nerfdiff.checkpoint import load_model
 from nerfdiff.cli import load_config
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.cutout import Mask
+from nerfdiff.distill.kept_steps import KeptSteps
 from nerfdiff.distill.priors import all_cameras
 from nerfdiff.evaluation.distill import build_strategy
 from nerfdiff.evaluation.progress import SceneProgress
@@ -32,6 +33,7 @@ from nerfdiff.evaluation.run import autocast, choose_device, framed_as_trained, 
 from nerfdiff.exported_model import LoadedModel
 from nerfdiff.exports.export import FORMATS, FieldExport
 from nerfdiff.exports.views import render_rgba, to_image
+from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.fit.saved_field import SavedField, load_field, save_field
 from nerfdiff.stability.familiar import Familiar
 from nerfdiff.stability.mend import mend_of
@@ -143,16 +145,18 @@ class Model:
 
     def distil_batch(self, cfg: DictConfig, batch: ViewBatch, mask: Mask | None = None) -> "Scene":
         """Make a scene of what `prepare` returned."""
-        strategy, precision = build_strategy(cfg), auto_precision(self.device.type)
+        strategy, precision, kept = build_strategy(cfg), auto_precision(self.device.type), KeptSteps(cfg.keep_steps)
         with SceneProgress(strategy.name, 1, cfg.progress_every) as progress, autocast(self.device, precision):
-            (views,) = strategy.predict(self.loaded.model, [batch], cfg.seed, progress.callbacks(1))
+            callbacks = [*progress.callbacks(1), *([kept] if kept.count else ())]
+            (views,) = strategy.predict(self.loaded.model, [batch], cfg.seed, callbacks)
         if views.field is None:
             raise ConfigError(f"strategy={strategy.name} leaves no scene: choose one that does, as ngd_current")
         if views.status != "ok":
             log.warning("the fit was %s: this is the last field before that", views.status)
         stands = Upright.seen_by(all_cameras(batch)).to("cpu")
         picture = Image.fromarray(batch.source_pixels[0].permute(1, 2, 0).cpu().numpy())
-        return Scene(replace(views.field, stands=stands), picture, mask, views.status)
+        steps = kept.fields[0] if kept.fields else {}
+        return Scene(replace(views.field, stands=stands), picture, mask, views.status, steps)
 
 
 def _of_picture(cfg: DictConfig, picture: str | Path, loaded: LoadedModel) -> DictConfig:
@@ -181,12 +185,14 @@ class Scene:
         picture: as the model saw it; None where the scene was read from a file.
         mask: where the object was found, if that had to be.
         status: `ok`, or why the field is not the one that the fit ended with.
+        steps: fields from on the way, by how many steps of distillation had been done (`keep_steps`).
     """
 
     saved: SavedField
     picture: Image.Image | None = None
     mask: Mask | None = None
     status: str = "ok"
+    steps: Mapping[int, RefinedField] = field(default_factory=dict)
 
     def render(self, azimuth: float = 0.0, elevation: float | None = None, height: int | None = None) -> Image.Image:
         """A picture of the scene with a transparent background.

@@ -6,6 +6,7 @@ import os
 import re
 import shlex
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import pairwise
@@ -128,7 +129,17 @@ def job_folder(swept: str, overrides: Sequence[str] = ()) -> str:
     return "-".join(filter(None, [name, sha256_values([swept, *sorted(overrides)])[:8]]))
 
 
+def group_lines(*groups: str) -> str:
+    """Config groups with their choices, as a command's help shows them."""
+    width = max(map(len, groups)) + 4
+    lines = (f"  {group}".ljust(width) + ", ".join(choices(group)) for group in groups)
+    return "\n".join(textwrap.fill(line, 100, subsequent_indent=" " * width, break_on_hyphens=False) for line in lines)
+
+
 OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
+# of the commands' help
+OmegaConf.register_new_resolver("command", lambda name: " ".join(command_words(name)), replace=True)
+OmegaConf.register_new_resolver("groups", group_lines, replace=True)
 
 
 def explain(error: BaseException, cfg: DictConfig | None = None) -> str | None:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -13,9 +14,10 @@ from nerfdiff.api import Model, Scene, load, load_scene
 from nerfdiff.cli import command_words
 from nerfdiff.data.cutout import Mask, write_mask
 from nerfdiff.data.picture import scene_id
+from nerfdiff.evaluation.dashboard import show_picture
 from nerfdiff.exports.export import FieldExport, check_formats
 from nerfdiff.exports.views import over, render_rgba
-from nerfdiff.fit.saved_field import FIELD
+from nerfdiff.fit.saved_field import FIELD, STEPS, save_steps
 from nerfdiff.results.pictures import contact_sheet
 from nerfdiff.utils.config import plain
 from nerfdiff.utils.errors import ConfigError, DataError, UserError
@@ -83,13 +85,17 @@ def _make(cfg: DictConfig, model: Model, image: Path, folder: Path) -> None:
     scene = _kept(folder, identity, model)
     if scene is None:
         scene = model.distil_batch(cfg, batch, mask)
+        shutil.rmtree(folder / STEPS, ignore_errors=True)  # of an earlier scene
         scene.save(folder / FIELD)
+        save_steps(folder, scene.saved, scene.steps)
         write_text(
             folder / SCENE, json.dumps({"picture": str(image), "identity": identity, "status": scene.status}) + "\n"
         )
     else:
         log.info("%s: the scene is there already, in %s", image, folder / FIELD)
     written = [_views(scene, batch.source[0].cpu(), folder / "views.png")]
+    facts = {"picture": str(image), "status": scene.status, "folder": str(folder)}
+    show_picture(cfg, Path(cfg.out), folder.name, facts, written[0])
     export = FieldExport.of(scene.saved, cfg)
     for kind in cfg.format:
         name = {"mp4": "orbit", "gif": "orbit", "html": "viewer"}.get(kind, folder.name)
@@ -104,7 +110,8 @@ def _identity(cfg: DictConfig, model: Model, image: Path, mask: Mask | None) -> 
     files = [sha256_file(file) for file in (image, model.loaded.path, cfg.picture.mask) if file is not None]
     found = None if mask is None else mask.where.tobytes().hex()
     settings = [plain(cfg[key]) for key in ("strategy", "picture", "picture_views", "mend_input", "mend")]
-    return sha256_values([files, found, settings, cfg.seed, str(model.device)])
+    steps = [cfg.keep_steps] if cfg.keep_steps else []
+    return sha256_values([files, found, settings, cfg.seed, str(model.device), *steps])
 
 
 def _kept(folder: Path, identity: str, model: Model) -> Scene | None:

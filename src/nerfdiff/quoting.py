@@ -15,6 +15,7 @@ PATHS = re.compile(r"ckpt|init|kept_renderings|image|mask|out|root|results|run|d
 
 LISTS: dict[str, dict[str, str]] = {
     "export": {"field": "fields", "format": "format"},
+    "view": {"field": "fields"},
     "picture": {"image": "images", "images": "images", "format": "format"},
 }
 """By commands: words that take a list, and their keys, which differ where a group of configs has the word."""

@@ -71,6 +71,11 @@ class Upright:
         """Move or cast as `Tensor.to`."""
         return Upright(self.point.to(*args, **kwargs), self.up.to(*args, **kwargs))
 
+    def axes(self, source: Cameras) -> Float[Tensor, "3 3"]:
+        """Unit vectors to the right, up, and to the front, which is the side of the camera `source` [1]."""
+        front = self.around(source, torch.zeros(1).to(self.up), torch.zeros(1).to(self.up)).c2w[0, :3, 2].neg()
+        return torch.stack([torch.linalg.cross(self.up, front), self.up, front])
+
     def around(self, source: Cameras, azimuth: Float[Tensor, "n"], elevation: Float[Tensor, "n"] | None) -> Cameras:
         """Cameras [n] that look at the point from the distance of the camera `source` [1], with its lens.
 

@@ -14,7 +14,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.hparams import api_pb2, metadata
 
 from nerfdiff.cli import load_config
-from nerfdiff.evaluation.dashboard import Dashboard, accuracy_layout, show_in_dashboard
+from nerfdiff.evaluation.dashboard import Dashboard, accuracy_layout, show_in_dashboard, show_picture
 from nerfdiff.metrics.predictions import PredictionWriter
 from nerfdiff.results.row import ResultRow
 
@@ -81,15 +81,16 @@ def test_a_row_becomes_a_run_with_its_settings_numbers_text_and_pictures(tmp_pat
     dashboard = Dashboard(["data"], LAYOUT)
     for _ in range(2):  # again, as a command that is repeated would: in place of the first
         dashboard.write(config(tmp_path), row(tmp_path), sheet)
-    events = read(tmp_path / "tensorboard" / "job0" / "ngd-0123abcd")
-    assert scalars(events) == {"accuracy/psnr": [22.0], "cost/scene_s": [3.5], "counts/denoiser_calls": [50.0]}
+    events = read(tmp_path / "tensorboard" / "ngd seed=0 budget.steps=16")
+    found = {tag: values for tag, values in scalars(events).items() if not tag.startswith(("distill/", "scenes/"))}
+    assert found == {"accuracy/psnr": [22.0], "cost/scene_s": [3.5], "counts/denoiser_calls": [50.0]}
     start = metadata.parse_session_start_info_plugin_data(
         events.PluginTagToContent(metadata.PLUGIN_NAME)[metadata.SESSION_START_INFO_TAG]
     )
     hparams = {name: getattr(value, value.WhichOneof("kind")) for name, value in start.hparams.items()}
-    assert hparams == {"strategy": "ngd", "K": 25.0, "seed": 0.0, "budget.steps": 16.0}
+    assert hparams == {"kind": "distillation", "strategy": "ngd", "K": 25.0, "seed": 0.0, "budget.steps": 16.0}
     assert session_status(events) == api_pb2.STATUS_SUCCESS
-    (image,) = events.Images("pictures")
+    (image,) = events.Images("accuracy/pictures")
     assert (image.width, image.height) == (7, 5)
     assert "python src/distill.py strategy=ngd" in text(events, "about")
     assert "| accuracy/psnr | 22 |" in text(events, "about")
@@ -98,7 +99,8 @@ def test_a_row_becomes_a_run_with_its_settings_numbers_text_and_pictures(tmp_pat
 
 def test_curves_are_means_over_scenes_by_step_and_values_scene_by_scene(tmp_path):
     Dashboard([], LAYOUT).write(config(tmp_path), row(tmp_path), None)
-    curves = scalars(read(tmp_path / "tensorboard" / "curves" / "job0" / "ngd-0123abcd"))
+    (folder,) = (tmp_path / "tensorboard").iterdir()  # one entry for the run
+    curves = scalars(read(folder))
     assert curves["distill/agreement"] == [20.0, 35.0] and curves["scenes/psnr"] == [21.5, 22.5]
     assert "distill/weight" not in curves and "scenes/lpips" not in curves
 
@@ -108,8 +110,8 @@ def test_a_lost_scene_leaves_the_others_their_curve(tmp_path):
     trace = tmp_path / lost.folder / "predictions" / "ngd" / "a" / "trace.csv"
     trace.write_text("step,t,weight,loss_first,loss_last,agreement\n0,0.5,,nan,nan,nan\n")
     Dashboard((), LAYOUT).write(config(tmp_path), lost, None)
-    curves = scalars(read(tmp_path / "tensorboard" / "curves" / "job0" / "ngd-0123abcd"))
-    assert curves["distill/agreement"] == [30.0, 50.0]
+    (folder,) = (tmp_path / "tensorboard").iterdir()
+    assert scalars(read(folder))["distill/agreement"] == [30.0, 50.0]
 
 
 def test_a_failed_run_is_shown_as_one(tmp_path):
@@ -121,19 +123,43 @@ def test_a_failed_run_is_shown_as_one(tmp_path):
     assert r"| error | no \| room |" in text(events, "about")
     late = row(tmp_path, status="nan")
     Dashboard([], LAYOUT).write(config(tmp_path), late, None)
-    assert not (tmp_path / "tensorboard" / "curves").exists()
+    assert not scalars(read(next((tmp_path / "tensorboard").glob("ngd *")))).keys() & {"distill/agreement"}
 
 
-def test_rows_in_folders_above_the_results_and_of_one_folder_have_runs_of_their_own(tmp_path):
-    (tmp_path / "home").mkdir()
-    rows = [row(tmp_path / "home"), row(tmp_path / "home", strategy="copy_input", status="error")]
-    for one in rows:
-        one.folder = f"../elsewhere/{one.folder}"
-        one.status = "error"
-        Dashboard([], LAYOUT).write(config(tmp_path / "home"), one, None)
-    runs = sorted(path.parent.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("events.*"))
-    main = "home/tensorboard/elsewhere/job0/ngd-0123abcd"
-    assert runs == [main, f"{main}/copy_input"]
+def test_runs_are_called_by_what_tells_them_apart_and_keep_to_themselves(tmp_path):
+    dashboard = Dashboard(["data", "seed"], LAYOUT)
+    for one in (row(tmp_path), row(tmp_path, strategy="copy_input", status="error")):
+        dashboard.write(config(tmp_path), one, None)
+    words = ["ckpt=/far/away/run_7/", "budget.rays=2048", "strategy.name='a b/c'", f"x={'y' * 200}"]
+    dashboard.write(config(tmp_path), row(tmp_path, overrides=words[:3]), None)
+    dashboard.write(config(tmp_path), row(tmp_path, overrides=words), None)
+    runs = sorted(path.parent.name for path in tmp_path.rglob("events.*"))
+    assert runs[0] == "copy_input budget.steps=16" and runs[2] == "ngd ckpt=run_7 budget.rays=2048 strategy.name=c_"
+    assert runs[1] == "ngd budget.steps=16" and runs[3].startswith(runs[2] + " x=yyy") and len(runs[3]) < 120
+    # the same words about other files: not in place of the first
+    other = row(tmp_path, folder="elsewhere/ngd-4567", status="error", psnr=5.0)
+    for _ in range(2):
+        dashboard.write(config(tmp_path), other, None)
+    (second,) = (path.parent for path in tmp_path.rglob("events.*") if path.parent.name not in runs)
+    assert second.name.startswith("ngd budget.steps=16 ") and scalars(read(second))["accuracy/psnr"] == [5.0]
+    assert scalars(read(second.parent / "ngd budget.steps=16"))["accuracy/psnr"] == [22.0]
+
+
+def test_a_picture_has_an_entry(tmp_path):
+    cfg = load_config("picture", [f"out={tmp_path}", "strategy=none", "paths.output_dir=none"])
+    Image.fromarray(np.full((5, 7, 4), 9, np.uint8)).save(tmp_path / "views.png")
+    trace = tmp_path / "trace.csv"
+    trace.write_text("step,t,weight,loss_first,loss_last,agreement\n0,0.5,,0.1,0.1,20\n1,0.4,,0.1,0.1,22\n")
+    show_picture(cfg, tmp_path, "car", {"picture": "my car.jpg", "status": "ok"}, tmp_path / "views.png", trace)
+    events = read(tmp_path / "tensorboard" / "picture" / "car strategy=none")
+    assert len(events.Images("accuracy/pictures")) == 1 and scalars(events)["distill/agreement"] == [20.0, 22.0]
+    assert "| picture | my car.jpg |" in text(events, "about") and "elevation: null" in text(events, "config")
+    start = metadata.parse_session_start_info_plugin_data(
+        events.PluginTagToContent(metadata.PLUGIN_NAME)[metadata.SESSION_START_INFO_TAG]
+    )
+    assert start.hparams["kind"].string_value == "picture" and session_status(events) == api_pb2.STATUS_SUCCESS
+    show_picture(load_config("picture", ["dashboard=null"]), tmp_path, "van", {}, None)
+    assert len(list((tmp_path / "tensorboard" / "picture").iterdir())) == 1
 
 
 @pytest.mark.parametrize("command", ["evaluate", "distill"])
@@ -183,7 +209,7 @@ def test_tensorboard_itself_compares_the_runs(tmp_path):
     experiment = ask("plugin/hparams/experiment", {"experimentName": ""})
     assert {info["name"] for info in experiment["hparamInfos"]} >= {"strategy", "K", "budget.steps", "budget.rays"}
     metrics = ["accuracy/psnr", "cost/scene_s", "counts/denoiser_calls"]
-    assert sorted(info["name"]["tag"] for info in experiment["metricInfos"]) == metrics
+    assert sorted(info["name"]["tag"] for info in experiment["metricInfos"])[:3] == metrics
     wanted = {"allowedStatuses": ["STATUS_SUCCESS"], "startIndex": 0, "sliceSize": 10}
     columns = [{"metric": {"tag": tag}} for tag in metrics]
     groups = ask("plugin/hparams/session_groups", wanted | {"colParams": columns})["sessionGroups"]

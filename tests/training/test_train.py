@@ -56,13 +56,16 @@ def test_a_run_shows_itself_in_tensorboard(whole):
     assert start.hparams["model.name"].string_value == "tiny" and start.hparams["data.batch_size"].number_value == 4
     end = metadata.parse_session_end_info_plugin_data(said[metadata.SESSION_END_INFO_TAG])
     assert end.status == api_pb2.STATUS_SUCCESS
-    assert events.Scalars("val/psnr")[-1].value == pytest.approx(metrics["val/psnr"])
+    assert start.hparams["kind"].string_value == "training"
+    assert events.Scalars("held-out/psnr")[-1].value == pytest.approx(metrics["val/psnr"])
     tags = events.Tags()
     (layout,) = events.Tensors("custom_scalars__config__")
     charts = layout_pb2.Layout.FromString(layout.tensor_proto.string_val[0]).category[0].chart
     shown = {tag for chart in charts for tag in chart.multiline.tag}
-    assert "val/psnr" in shown and shown <= set(tags["scalars"])
-    assert "hp_metric" not in tags["scalars"] and "input | render | depth | cdm | truth" in tags["images"]
+    assert "held-out/psnr" in shown and shown <= set(tags["scalars"])
+    assert tags["images"] == ["held-out/input, render, depth, cdm, truth"]
+    groups = [tag.partition("/")[0] for tag in sorted([*tags["scalars"], *tags["images"]])]
+    assert list(dict.fromkeys(groups)) == ["held-out", "train"]  # as TensorBoard sorts them
     config = events.Tensors("config/text_summary")[0].tensor_proto.string_val[0].decode()
     assert "batch_size: 4" in config
 

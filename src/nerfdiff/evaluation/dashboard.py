@@ -1,8 +1,9 @@
-"""TensorBoard for evaluate.py and distill.py: a run for every row of results."""
+"""TensorBoard for evaluate.py, distill.py and picture.py: a run for every row of results, and for every picture."""
 
 import csv
 import logging
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -24,12 +25,17 @@ from nerfdiff.metrics.table import METRICS, Metric, named
 from nerfdiff.results import tensorboard
 from nerfdiff.results.row import ResultRow, flatten
 from nerfdiff.results.tensorboard import Layout
+from nerfdiff.utils.errors import DataError
+from nerfdiff.utils.files import write_text
 from nerfdiff.utils.hashes import sha256_values
 
 log = logging.getLogger(__name__)
 
 FOLDER = "tensorboard"
-CURVES = "curves"
+OF = "of.txt"
+"""In a run's folder: where its predictions lie, so that others of the same words get another name."""
+LONGEST = 100
+"""Characters of a run's name, after which a digest stands for the rest."""
 SETTINGS = (
     *("strategy", "dataset", "model", "field", "weights", "prior", "K", "samples_per_ray", "precision", "backend"),
     *("compile", "scenes_at_once", "seed", "device"),
@@ -42,8 +48,9 @@ PER_SCENE = ("denoiser_calls", "field_queries")
 class Dashboard:
     """Write `tensorboard/` beside the file of results.
 
-    A row's run holds its settings, metrics and costs, text and contact sheet. Its curves, over the steps of
-    distillation and over the scenes, are a run of `curves/`: all scalars of the first are columns of the HPARAMS tab.
+    A row's run is called after its strategy and what else the command set. It holds settings, metrics and costs, text,
+    contact sheet, and curves over the steps of distillation and over the scenes. TensorBoard sorts tags by name: what
+    is looked at first begins with `accuracy/`. `kind` tells distillations from trainings in the HPARAMS tab.
 
     Args:
         ignored: overrides that tell no runs apart, or what they begin with.
@@ -61,27 +68,63 @@ class Dashboard:
             sheet: PNG of the row's pictures.
         """
         home = Path(cfg.results).parent
-        name, hparams = _name(row), _hparams(row, self.ignored)
+        hparams = {"kind": "distillation"} | _hparams(row, self.ignored)
+        folder = _folder(home / FOLDER, self._name(row), f"{row.folder} {row.strategy}")
         facts = {"status": row.status, "error": row.error, **hparams, **_metrics(row)}
-        settings = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
-        texts = {
-            "about": f"{tensorboard.code(row.command or '')}\n\n{tensorboard.table(facts)}",
-            "config": tensorboard.code(OmegaConf.to_yaml(settings, resolve=HydraConfig.initialized()), "yaml"),
-        }
-        with _fresh(home / FOLDER / name) as writer:
-            tensorboard.begin(writer, hparams, texts, accuracy_layout() | self.layout)
-            for tag, value in _metrics(row).items():
-                writer.add_scalar(tag, value, 0)
-            if sheet is not None:
-                writer.add_image("pictures", np.asarray(Image.open(sheet)), 0, dataformats="HWC")
-            tensorboard.end(writer, row.status == "ok")
+        about = f"{tensorboard.code(row.command or '')}\n\n{tensorboard.table(facts)}"
         curves = {} if row.status != "ok" else _traces(home, row) | _scenes(home, row)
-        if curves:
-            with _fresh(home / FOLDER / CURVES / name) as writer:
-                for tag, values in curves.items():
-                    for step, value in enumerate(values):
-                        if value is not None and math.isfinite(value):
-                            writer.add_scalar(tag, value, step)
+        numbers = {tag: [value] for tag, value in _metrics(row).items()}
+        self._write(folder, cfg, hparams, about, numbers | curves, sheet, row.status == "ok")
+
+    def write_picture(
+        self, cfg: DictConfig, home: Path, name: str, facts: Mapping[str, Any], sheet: Path | None, trace: Path | None
+    ) -> None:
+        """Write the run of one picture's scene into `<home>/tensorboard/picture/`, where other views are not known.
+
+        Args:
+            name: of the scene.
+            facts: what it was made of, and how it went (`status`).
+            sheet: PNG of its views.
+            trace: CSV of its distillation.
+        """
+        hparams = {"kind": "picture", "strategy": cfg.strategy.name, "seed": cfg.seed}
+        if HydraConfig.initialized():
+            given = tensorboard.overridden(HydraConfig.get().overrides.task, [*self.ignored, "images", "image"])
+            hparams |= {key: value for key, value in given.items() if key not in hparams}
+        folder = _folder(home / FOLDER, _called(f"picture/{name}", {"strategy": cfg.strategy.name}), str(facts))
+        about = tensorboard.table(dict(facts))
+        self._write(folder, cfg, hparams, about, _curves([_read(trace)] if trace else []), sheet, True)
+
+    def _write(
+        self,
+        folder: Path,
+        cfg: DictConfig,
+        hparams: Mapping[str, Any],
+        about: str,
+        scalars: Mapping[str, Sequence[float | None]],
+        sheet: Path | None,
+        succeeded: bool,
+    ) -> None:
+        settings = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+        config = OmegaConf.to_yaml(settings, resolve=HydraConfig.initialized())
+        texts = {"about": about, "config": tensorboard.code(config, "yaml")}
+        with _fresh(folder) as writer:
+            tensorboard.begin(writer, hparams, texts, accuracy_layout() | self.layout)
+            for tag, values in scalars.items():
+                for step, value in enumerate(values):
+                    if value is not None and math.isfinite(value):
+                        writer.add_scalar(tag, value, step)
+            if sheet is not None:
+                writer.add_image(
+                    "accuracy/pictures", np.asarray(Image.open(sheet).convert("RGB")), 0, dataformats="HWC"
+                )
+            tensorboard.end(writer, succeeded)
+
+    def _name(self, row: ResultRow) -> str:
+        """Name a row's run by its strategy and what else its command set."""
+        given = tensorboard.overridden(row.overrides or (), self.ignored)
+        given.pop("strategy", None)
+        return ("failed/" if row.folder is None else "") + _called(row.strategy or "unknown", given)
 
 
 def accuracy_layout() -> Layout:
@@ -108,16 +151,37 @@ def show_in_dashboard(cfg: DictConfig, rows: Sequence[ResultRow], sheet: Path | 
     try:
         for number, row in enumerate(rows):
             dashboard.write(cfg, row, sheet if number == 0 else None)
-    except OSError as error:
+    except (OSError, DataError) as error:
         log.warning("TensorBoard's files cannot be written: %s", error)
 
 
-def _name(row: ResultRow) -> str:
-    """Name a row's run by the folder of its predictions and, as several strategies may lie there, its strategy."""
-    if row.folder is None:
-        return f"failed/{row.strategy}-{sha256_values(row.overrides)[:8]}"
-    folder = Path(*(part for part in Path(row.folder).parts if part != ".."))
-    return str(folder if folder.name.startswith(f"{row.strategy}-") else folder / row.strategy)
+def show_picture(
+    cfg: DictConfig, home: Path, name: str, facts: Mapping[str, Any], sheet: Path | None, trace: Path | None = None
+) -> None:
+    """Write `cfg.dashboard` for a picture's scene (see `Dashboard.write_picture`), if there is to be one."""
+    if cfg.dashboard is None:
+        return
+    try:
+        instantiate(cfg.dashboard, _convert_="all").write_picture(cfg, home, name, facts, sheet, trace)
+    except (OSError, DataError) as error:
+        log.warning("TensorBoard's files cannot be written: %s", error)
+
+
+def _called(what: str, given: Mapping[str, str]) -> str:
+    """Write settings behind a name: paths by their last part, and a digest for what would be too long."""
+    words = [f"{key}={value.rstrip('/').rpartition('/')[2]}" for key, value in given.items()]
+    name = " ".join([what, *(re.sub(r"[^\w.,=+\[\]-]+", "_", word) for word in words)])
+    return name if len(name) <= LONGEST else f"{name[:LONGEST].rstrip()}… {sha256_values(name)[:8]}"
+
+
+def _folder(home: Path, name: str, of: str) -> Path:
+    """Return the folder of a run; one of the same name that is about something else keeps its own."""
+    for folder in (home / name, home / f"{name} {sha256_values(of)[:8]}"):
+        known = folder / OF
+        if not known.is_file() or known.read_text(encoding="utf-8") == of:
+            break
+    write_text(known, of)
+    return folder
 
 
 def _hparams(row: ResultRow, ignored: Sequence[str]) -> dict[str, Any]:
@@ -143,7 +207,11 @@ def _metrics(row: ResultRow) -> dict[str, float]:
 def _traces(home: Path, row: ResultRow) -> dict[str, list[float | None]]:
     """Read the traces of distillation, where there are any: means over scenes, by step."""
     folder = home / row.folder / "predictions" / row.strategy
-    scenes = [_read(folder / scene / TRACE) for scene in read_plan(folder)["scenes"]]
+    return _curves([_read(folder / scene / TRACE) for scene in read_plan(folder)["scenes"]])
+
+
+def _curves(scenes: Sequence[Sequence[Mapping[str, str]]]) -> dict[str, list[float | None]]:
+    """Return means over scenes' traces, by step."""
     steps = list(zip_longest(*filter(None, scenes), fillvalue={}))  # a scene that failed has fewer
     return {f"distill/{field.name}": [_mean(step, field.name) for step in steps] for field in fields(Step) if steps}
 

@@ -4,6 +4,7 @@ import logging
 import re
 from collections.abc import Sequence
 from datetime import timedelta
+from pathlib import Path
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -14,7 +15,8 @@ from lightning.fabric.strategies import DDPStrategy
 from omegaconf import DictConfig
 
 from nerfdiff.distill.strategy import Strategy
-from nerfdiff.evaluation.dashboard import show_in_dashboard
+from nerfdiff.distill.trace import TRACE
+from nerfdiff.evaluation.dashboard import show_in_dashboard, show_picture
 from nerfdiff.evaluation.evaluate import show
 from nerfdiff.evaluation.measure import measure, record_failure
 from nerfdiff.evaluation.pictures import sheet
@@ -72,7 +74,11 @@ def distill(cfg: DictConfig) -> ResultRow | None:
         show_in_dashboard(cfg, [row], pictures)
         show([row], run.folder / "table.md")
     if cfg.image:
-        log.info("verdict: %s", costs(run, strategy)[0]["verdict"])
+        (scene,), (cost,) = run.scene_ids, costs(run, strategy)
+        log.info("verdict: %s", cost["verdict"])
+        facts = {"picture": cfg.image, "verdict": cost["verdict"], "status": cost["status"], "folder": str(run.folder)}
+        trace = run.predictions / strategy.name / scene / TRACE
+        show_picture(cfg, Path(cfg.results).parent, scene, facts, pictures, trace if trace.is_file() else None)
     log.info("fields, traces and orbits: %s", run.predictions / strategy.name)
     return row
 

@@ -14,12 +14,14 @@ from typing import Any
 import torch
 
 from nerfdiff.data.batch import ViewBatch
+from nerfdiff.distill.kept_steps import KeptSteps
 from nerfdiff.distill.priors import all_cameras
 from nerfdiff.distill.strategy import PredictedViews, Strategy
 from nerfdiff.distill.trace import PLOT, TRACE, plot_trace, write_trace
 from nerfdiff.evaluation.progress import SceneProgress
 from nerfdiff.evaluation.run import EvaluationRun
-from nerfdiff.fit.saved_field import FIELD, SavedField, load_field, save_field
+from nerfdiff.fit.refined_field import RefinedField
+from nerfdiff.fit.saved_field import FIELD, SavedField, load_field, save_field, save_steps
 from nerfdiff.metrics.image import psnr
 from nerfdiff.metrics.predictions import SCENE, PredictionWriter
 from nerfdiff.results.pictures import orbit_video
@@ -59,14 +61,16 @@ def predict(run: EvaluationRun, strategy: Strategy, rank: int = 0, processes: in
         for wait in (False, True):
             for group in _claimed(run, writer, share, wait):
                 scenes = [scene.to(run.device) for scene in group]
-                callbacks = progress.callbacks(len(scenes))
+                kept = KeptSteps(run.settings.keep_steps)
+                callbacks = [*progress.callbacks(len(scenes)), *([kept] if kept.count else ())]
                 watch, clock = Stopwatch(run.device), PartClock(run.device)
                 with watch.measure(), clock.running(), run.autocast():
                     predicted = strategy.predict(run.model, scenes, run.settings.seed, callbacks)
                 spent = _shares(watch.seconds[0], clock.seconds(), predicted) | {"warm": warm}
                 warm = True
-                for scene, views in zip(scenes, predicted, strict=True):
-                    score = _write(run, strategy, writer, scene, views, spent)
+                for number, (scene, views) in enumerate(zip(scenes, predicted, strict=True)):
+                    steps = kept.fields[number] if kept.fields else {}
+                    score = _write(run, strategy, writer, scene, views, spent, steps)
                     writer.release(scene.scene_ids[0])
                     progress.advance("" if score is None else f"PSNR {score:.2f}")
                 if time.monotonic() > until:
@@ -123,8 +127,13 @@ def _write(
     scene: ViewBatch,
     views: PredictedViews,
     spent: Mapping[str, float],
+    steps: Mapping[int, RefinedField],
 ) -> float | None:
-    """Save one scene's views, and what was `spent` on it, see `_shares`; their PSNR, if there is a truth."""
+    """Save one scene's views, what was `spent` on it (see `_shares`), and fields of some steps of its distillation.
+
+    Returns:
+        the views' PSNR, if there is a truth.
+    """
     verdict, signs = None, None
     if run.judge is not None and views.field_queries > 0:  # of baselines, which ask no model, it knows nothing
         with run.autocast():
@@ -150,16 +159,24 @@ def _write(
         status=views.status,
         verdict=verdict,
         signs=signs,
-        beside=partial(_leave, run, strategy, scene, views),
+        beside=partial(_leave, run, strategy, scene, views, steps),
     )
     return psnr(views.images.clamp(0, 1), scene.targets[0]).mean().item() if run.data else None
 
 
-def _leave(run: EvaluationRun, strategy: Strategy, scene: ViewBatch, views: PredictedViews, folder: Path) -> None:
+def _leave(
+    run: EvaluationRun,
+    strategy: Strategy,
+    scene: ViewBatch,
+    views: PredictedViews,
+    steps: Mapping[int, RefinedField],
+    folder: Path,
+) -> None:
     """Write the field, its trace and an orbit into the scene's folder; a field that was fitted in any case."""
     if views.field is not None and (views.trace or run.settings.per_scene):
         stands = Upright.seen_by(all_cameras(scene)).to("cpu")
-        save_field(folder / FIELD, replace(views.field, stands=stands))
+        save_field(folder / FIELD, saved := replace(views.field, stands=stands))
+        save_steps(folder, saved, steps)
     if not run.settings.per_scene:
         return
     if views.trace:

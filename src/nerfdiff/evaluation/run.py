@@ -67,6 +67,7 @@ class RunSettings:
         minutes: after which no scene begins.
         progress_every: seconds between lines where there is no terminal.
         per_scene: leave every scene's field, trace and orbit beside its views.
+        keep_steps: how many fields from on the way of distillation are left beside each scene's.
         stress, severity, neutral: what goes wrong on purpose, by how much, and how much is nothing; None: nothing.
     """
 
@@ -80,6 +81,7 @@ class RunSettings:
     minutes: float | None
     progress_every: float | None
     per_scene: bool
+    keep_steps: int
     orbit: Orbit
     sheet: Sheet
     stress: str | None
@@ -89,7 +91,7 @@ class RunSettings:
     @staticmethod
     def of(cfg: DictConfig) -> "RunSettings":
         """Read the settings of a composed config."""
-        same = ("run_name", "seed", "scenes_at_once", "minutes", "progress_every", "per_scene")
+        same = ("run_name", "seed", "scenes_at_once", "minutes", "progress_every", "per_scene", "keep_steps")
         return RunSettings(
             **{name: cfg[name] for name in same},
             dataset=f"{cfg.data.name}/{cfg.data.test_split}",
@@ -319,6 +321,7 @@ def _run(
         }
         | (stress.identity if stress is not None else {})
         | ({"mend": mend.identity} if mend is not None else {})
+        | ({"keep_steps": cfg.keep_steps} if cfg.keep_steps else {})
     )
     if cfg.seconds_per_scene is not None and "seconds" not in cfg.strategy:
         log.warning("seconds_per_scene acts on strategies that fit a field: %s takes its time", cfg.strategy.name)

@@ -23,9 +23,7 @@ COLOUR = "_COLOUR"  # trimesh writes such an attribute as it is; then it takes g
 
 def to_y_up(points: Float[Tensor, "n 3"], source: Cameras, stands: Upright) -> Float[Tensor, "n 3"]:
     """Points of the input camera's space in the convention of files."""
-    front = stands.around(source, torch.zeros(1), torch.zeros(1)).c2w[0, :3, 2].neg()
-    axes = torch.stack([torch.linalg.cross(stands.up, front), stands.up, front])
-    return (points - stands.point) @ axes.T
+    return (points - stands.point) @ stands.axes(source).T
 
 
 def write_mesh(path: Path, surface: Surface, source: Cameras, stands: Upright) -> Path:

@@ -46,7 +46,6 @@ def write_viewer(path: Path, saved: SavedField, stands: Upright, title: str, cel
     units = -hidden % 4  # of no weight
     weight = F.pad(inner["weight"], (0, channels - inner["weight"].shape[1], 0, units))
     numbers = [weight, F.pad(inner["bias"], (0, units)), F.pad(outer["weight"], (0, units)).T, outer["bias"]]
-    front = stands.around(source, torch.zeros(1), torch.zeros(1)).c2w[0, :3, 2].neg()
     arm = source.centres[0] - stands.point
     K, size = source.K[0], (source.width, source.height)
     scene = {
@@ -70,7 +69,7 @@ def write_viewer(path: Path, saved: SavedField, stands: Upright, title: str, cel
         "radius": (far - near) / 2,
         "middle": stands.point.tolist(),
         "up": stands.up.tolist(),
-        "front": front.tolist(),
+        "front": stands.axes(source)[2].tolist(),
         "distance": float(arm.norm()),
         "elevation": math.degrees(math.asin(float((arm @ stands.up) / arm.norm()))),
         "samples": samples,

@@ -1,6 +1,6 @@
 """Renderings of a field from paths of cameras, with transparency."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +13,9 @@ from nerfdiff.cameras import Cameras, Rays
 from nerfdiff.fit.saved_field import SavedField
 from nerfdiff.trajectories import Upright
 from nerfdiff.utils.errors import ConfigError
+
+RAYS = 4096
+"""Rendered at once, between two looks whether the picture is still wanted."""
 
 
 @dataclass(frozen=True)
@@ -74,25 +77,44 @@ def render_rgba(saved: SavedField, cameras: Cameras, height: int) -> Float[Tenso
         height: of the pictures; their width follows from the cameras' aspect ratio.
     """
     cameras = cameras.resized(height, max(1, round(height * cameras.width / cameras.height)))
-    pictures = []
-    near, far = saved.field.near, saved.field.far
-    for view in range(len(cameras)):
-        rays = cameras[view].rays(near[0], far[0])
-        there = _somewhere_near(saved, cameras[view : view + 1])
-        chosen = Rays(*(part[there] for part in (rays.origins, rays.directions, rays.near, rays.far)))
-        rgb, alpha, _ = render_rays(saved, chosen)
-        picture = torch.zeros(4, *there.shape)
-        picture[:, there] = torch.cat([rgb, alpha[:, None]], 1).T.cpu()
-        pictures.append(picture)
-    return torch.stack(pictures)
+    near, far = float(saved.field.near[0]), float(saved.field.far[0])
+    pictures = [render_maps(saved, cameras[view : view + 1], near, far) for view in range(len(cameras))]
+    return torch.stack([picture[:4] for picture in pictures if picture is not None])
 
 
-def _somewhere_near(saved: SavedField, camera: Cameras) -> Bool[Tensor, "height width"]:
+@torch.no_grad()
+def render_maps(
+    saved: SavedField, camera: Cameras, near: float, far: float, unwanted: Callable[[], bool] = lambda: False
+) -> Float[Tensor, "5 height width"] | None:
+    """Colour of the scene alone, opacity, and distance along the ray of a camera [1], on the CPU.
+
+    Args:
+        near, far: bounds of the rays, in scene units.
+        unwanted: asked now and then; where it is true, the picture is left and None returned.
+    """
+    there = _somewhere_near(saved, camera, near, far)
+    rays = camera[0].rays(near, far)
+    chosen = [part[there].split(RAYS) for part in (rays.origins, rays.directions, rays.near, rays.far)]
+    picture = torch.zeros(5, *there.shape)
+    picture[4] = far
+    parts = []
+    for part in zip(*chosen, strict=True):
+        if unwanted():
+            return None
+        rgb, alpha, distance = render_rays(saved, Rays(*part))
+        parts.append(torch.cat([rgb, alpha[:, None], distance[:, None]], 1).cpu())
+    picture[:, there.cpu()] = torch.cat(parts).T if parts else torch.zeros(5, 0)
+    return picture
+
+
+def _somewhere_near(saved: SavedField, camera: Cameras, near: float, far: float) -> Bool[Tensor, "height width"]:
     """Where a small picture of a camera [1], as large as the input's, shows anything, or beside that."""
     small = saved.field.cameras
     if saved.renderer.background is None or camera.height < 2 * small.height or camera.width < 2 * small.width:
         return torch.ones(camera.height, camera.width, dtype=torch.bool, device=camera.K.device)
-    opacity = saved.field.render(saved.renderer, camera.resized(small.height, small.width)[None]).opacity[0]
+    bounds = (torch.full_like(saved.field.near, value) for value in (near, far))
+    cameras = camera.resized(small.height, small.width)[None]
+    opacity = saved.renderer.render_views(saved.field.field(), cameras, *bounds).opacity[0]
     beside = F.max_pool2d(opacity, 3, 1, padding=1)
     return F.interpolate(beside[None], size=(camera.height, camera.width))[0, 0] > 1 / 255
 
@@ -123,7 +145,7 @@ def over(rgba: Float[Tensor, "views 4 h w"], grey: float) -> Float[Tensor, "view
     return rgba[:, :3] * alpha + (1 - alpha) * grey
 
 
-def to_image(rgba: Float[Tensor, "4 h w"]) -> Image.Image:
-    """A picture of 8 bits."""
+def to_image(rgba: Float[Tensor, "channels h w"]) -> Image.Image:
+    """A picture of 8 bits, of colours alone or with opacity."""
     pixels = (rgba.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0)
     return Image.fromarray(pixels.contiguous().numpy())

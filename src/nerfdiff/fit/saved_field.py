@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
@@ -20,6 +20,8 @@ from nerfdiff.utils.errors import DataError
 from nerfdiff.utils.files import atomic
 
 FIELD = "field.safetensors"
+STEPS = "steps"
+"""Folder beside a field: fields from on the way to it, called after how many steps of distillation had been done."""
 FORMAT = 1
 MACHINES = ("backend", "kernel_precision")
 """Settings of the renderer that suit a machine, not a field."""
@@ -40,8 +42,8 @@ class SavedField:
     stands: Upright | None = None
 
 
-def save_field(path: str | Path, saved: SavedField) -> None:
-    """Write planes and decoder as float32, and the rest as JSON in the file's header (key `nerfdiff`).
+def save_field(path: str | Path, saved: SavedField, dtype: torch.dtype = torch.float32) -> None:
+    """Write planes and decoder as `dtype`, and the rest as JSON in the file's header (key `nerfdiff`).
 
     Raises:
         DataError: the file cannot be written.
@@ -57,7 +59,7 @@ def save_field(path: str | Path, saved: SavedField) -> None:
     }
     if saved.stands is not None:
         header["stands"] = {"point": saved.stands.point.tolist(), "up": saved.stands.up.tolist()}
-    state = {name: value.detach().cpu().contiguous() for name, value in field.state_dict().items()}
+    state = {name: value.detach().to("cpu", dtype).contiguous() for name, value in field.state_dict().items()}
     header["sha256"] = _digest(state)
     with atomic(Path(path)) as temporary:
         save_file(state, temporary, {"nerfdiff": json.dumps(header)})
@@ -91,6 +93,22 @@ def load_field(path: str | Path) -> SavedField:
         raise DataError(
             f"{path}: not a field saved by this project ({type(error).__name__}: {error}); distil the scene again"
         ) from error
+
+
+def save_steps(folder: Path, saved: SavedField, fields: Mapping[int, RefinedField]) -> None:
+    """Write fields from on the way to `saved`, by how many steps had been done, into a field's folder, as float16."""
+    for done, field in fields.items():
+        save_field(folder / STEPS / f"{done:04d}.safetensors", replace(saved, field=field), torch.float16)
+
+
+def load_steps(path: str | Path) -> dict[int, SavedField]:
+    """Read the fields that lie beside a field, by how many steps of distillation had been done.
+
+    Raises:
+        DataError: one of them cannot be read.
+    """
+    files = sorted((Path(path).parent / STEPS).glob("*.safetensors")) if Path(path).name == FIELD else []
+    return {int(file.stem): load_field(file) for file in files if file.stem.isdigit()}
 
 
 def _digest(state: Mapping[str, torch.Tensor]) -> str:

@@ -18,7 +18,7 @@ class Dashboard(Callback):
 
     Args:
         config: the file that the run's settings were written to.
-        hparams: keys of settings that tell runs apart, beside those that the command gave.
+        hparams: keys of settings that tell runs apart, beside those that the command gave, and their `kind`.
         ignored: keys of settings that do not, or what they begin with.
         layout: of the custom scalars tab.
     """
@@ -30,7 +30,7 @@ class Dashboard(Callback):
         for writer in _writers(trainer):
             text = self.config.read_text(encoding="utf-8")
             settings = yaml.safe_load(text)
-            values = {key: _at(settings, key) for key in self.hparams}
+            values = {"kind": "training"} | {key: _at(settings, key) for key in self.hparams}
             if HydraConfig.initialized():
                 values |= tensorboard.overridden(HydraConfig.get().overrides.task, self.ignored)
             texts = {"about": tensorboard.table(values), "config": tensorboard.code(text, "yaml")}

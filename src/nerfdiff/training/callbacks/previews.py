@@ -45,7 +45,7 @@ class Previews(Callback):
         strips = torch.cat([images.movedim(0, 1).flatten(1, 2) for images in columns.values()], -1)
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
-                logger.experiment.add_image(" | ".join(columns), strips.clamp(0, 1), trainer.global_step)
+                logger.experiment.add_image(f"held-out/{', '.join(columns)}", strips.clamp(0, 1), trainer.global_step)
 
     @torch.no_grad()
     def _pictures(

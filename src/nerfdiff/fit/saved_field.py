@@ -14,15 +14,13 @@ from nerfdiff.cameras import Cameras
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.fit.refined_field import RefinedField
-from nerfdiff.render.renderer import Renderer
+from nerfdiff.render.renderer import MACHINES, Renderer
 from nerfdiff.trajectories import Upright
 from nerfdiff.utils.errors import DataError
 from nerfdiff.utils.files import atomic
 
 FIELD = "field.safetensors"
 FORMAT = 1
-MACHINES = ("backend", "kernel_precision")
-"""Settings of the renderer that suit a machine, not a field."""
 
 
 @dataclass(frozen=True)

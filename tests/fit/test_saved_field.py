@@ -96,7 +96,7 @@ def scattered(density: float, size: int = 24) -> SavedField:
     return SavedField(field, replace(net.renderer, background=1.0))
 
 
-@pytest.mark.parametrize("density", [0.0, 0.1, 1.0, 4.0])
+@pytest.mark.parametrize("density", [0.0, 1.0, 4.0])
 def test_no_colour_of_views_that_were_not_checked_moves_by_more_than_one_of_255(density, tmp_path):
     kept = scattered(density)
     save_field(tmp_path / FIELD, kept)

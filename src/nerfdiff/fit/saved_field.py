@@ -16,7 +16,7 @@ from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.fit.compact_planes import compact, restored
 from nerfdiff.fit.refined_field import RefinedField
-from nerfdiff.render.renderer import MACHINES, Renderer
+from nerfdiff.render.renderer import Renderer
 from nerfdiff.trajectories import Upright
 from nerfdiff.utils.errors import DataError
 from nerfdiff.utils.files import atomic
@@ -24,6 +24,10 @@ from nerfdiff.utils.files import atomic
 FIELD = "field.safetensors"
 FORMAT = 2
 """1 had planes in float32 alone."""
+
+
+MACHINES = ("backend", "kernel_precision", "skip")
+"""Settings of the renderer that suit a machine, not a field."""
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,6 @@ from nerfdiff.utils.precision import full_precision
 CACHED_POINTS = 2**16
 """Points at once on a CPU, whatever `chunk` allows: more leave its caches, fewer cost more calls (measured)."""
 
-MACHINES = ("backend", "kernel_precision", "skip")
-"""Settings of the renderer that suit a machine, not a field."""
-
 PARTS = ("origins", "directions", "near", "far", "jitter", "coarse")
 """Arguments with one entry per ray."""
 

@@ -51,7 +51,7 @@ class NerfDiffModule(LightningModule):
         channels_last: memory layout of the U-Nets.
         seed: of all noise; see `nerfdiff.utils.randomness`.
         kept_renderings: folder where a frozen field's renderings are kept, instead of being made at every step.
-        renderer: `backend`, `kernel_precision` and `skip` of the `Renderer`, which suit a machine and are not saved.
+        renderer: `backend` and `kernel_precision` of the `Renderer`, which suit a machine and are not saved.
 
     Raises:
         ConfigError: losses that train nothing, or that ask for gradients which are not computed.

@@ -31,7 +31,6 @@ from nerfdiff.exported_model import export_model
 from nerfdiff.inputs import LAST, find_weights
 from nerfdiff.model import settings_of
 from nerfdiff.processes import lost_process, watch
-from nerfdiff.render.renderer import MACHINES
 from nerfdiff.stopping import Stopped
 from nerfdiff.stress.stress import stress_of, stressed_readers, with_stress
 from nerfdiff.training.callbacks.checkpoint import ClearCheckpointIO
@@ -99,7 +98,7 @@ def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
         channels_last=channels_last(cfg.channels_last, trainer.strategy.root_device, cfg.compile != "none"),
         seed=cfg.seed,
         kept_renderings=_kept_renderings(cfg, datamodule),
-        renderer={name: cfg[name] for name in MACHINES},
+        renderer={"backend": cfg.backend, "kernel_precision": cfg.kernel_precision},
     )
     if last is None:
         _begin(module, cfg, model_config)

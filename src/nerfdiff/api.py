@@ -146,6 +146,7 @@ class Model:
     def distil_batch(self, cfg: DictConfig, batch: ViewBatch, mask: Mask | None = None) -> "Scene":
         """Make a scene of what `prepare` returned."""
         strategy, precision, kept = build_strategy(cfg), auto_precision(self.device.type), KeptSteps(cfg.keep_steps)
+        self.loaded.model.renderer = replace(self.loaded.model.renderer, skip=cfg.skip)
         with SceneProgress(strategy.name, 1, cfg.progress_every) as progress, autocast(self.device, precision):
             callbacks = [*progress.callbacks(1), *([kept] if kept.count else ())]
             (views,) = strategy.predict(self.loaded.model, [batch], cfg.seed, callbacks)

@@ -119,9 +119,11 @@ def test_k_is_the_number_of_views_that_fields_were_fitted_to(data, run, tmp_path
         row = distill(config(data, run, tmp_path, *settings))
         assert (row.K, row.prior) == (used, "SceneCameras")
         assert row.denoiser_calls == 2 * 2 * used  # two steps, two scenes
+        sizes = [file.stat().st_size for file in (tmp_path / row.folder).rglob(FIELD)]
+        assert len(sizes) == 2 and row.field_bytes == sum(sizes)
         assert (f"{used} virtual views instead of the {asked}" in caplog.text) == (used < asked)
     none = distill(config(data, run, tmp_path, "strategy=none", *small))
-    assert none.K is none.prior is None
+    assert none.K is none.prior is None and none.field_bytes > 0  # of the fields that per_scene keeps
 
 
 def test_scenes_with_different_numbers_of_views_are_told(data, run, tmp_path, monkeypatch, caplog):

@@ -5,7 +5,7 @@ import torch
 
 from model_fixtures import input_cameras
 from nerfdiff.cameras import Rays
-from nerfdiff.field.cpu_field import Interpolate, scene_by_scene, suits
+from nerfdiff.field.cpu_field import SKIP, Faint, Interpolate, scene_by_scene, suits
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.field import TriplaneField
 from nerfdiff.field.triplane import Triplane
@@ -147,3 +147,71 @@ def test_not_a_number_stays_one_point():
     points = torch.tensor([[[0.0, 0.0, 1.2], [float("nan"), 0.0, 1.2]]])
     _, density = scene_by_scene(fast)[0](points)
     assert torch.equal(density[0, :1], scene_by_scene(fast)[0](points[:, :1])[1][0]) and density[0, 1].isnan()
+
+
+def outputs(function, *tensors, **given) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """The values of a function of table, weight and bias, and their gradients from `given`'s."""
+    leaves = [tensor.clone().requires_grad_() for tensor in tensors]
+    values = function(*leaves)
+    return values.detach(), list(torch.autograd.grad(values, leaves, given["from_"]))
+
+
+@pytest.mark.parametrize("share", [1e-9, 1e-3, 0.3])
+def test_what_a_faint_backward_pass_leaves_out_is_at_most_its_share_of_the_gradient(share):
+    torch.manual_seed(3)
+    table, weight, bias = torch.randn(3 * 25, 8), torch.randn(4, 8), torch.randn(4)
+    one = scene_by_scene(field(1, 5, 5))[0]
+    places = one._cells(2 * torch.rand(900, 3) - 1)
+    # of a rendering: most are tiny, a third nothing at all
+    gradient = torch.randn(900, 4) * 10 ** (-12 * torch.rand(900, 1))
+    gradient[::3] = 0
+
+    def exact(table, weight, bias):
+        return torch.nn.functional.silu(Interpolate.apply(table, *places)) @ weight.mT + bias
+
+    values, (of_table, of_weight, of_bias) = outputs(exact, table, weight, bias, from_=gradient)
+    left = gradient.abs().amax(1) <= share * gradient.abs().amax(1).mean()
+    assert left.sum() > 300 and gradient[left].abs().amax(1).sum() <= share * gradient.abs().amax(1).sum()
+    _, (kept_table, kept_weight, _) = outputs(exact, table, weight, bias, from_=gradient * ~left[:, None])
+    faint, found = outputs(lambda *own: Faint.apply(*own, *places, share), table, weight, bias, from_=gradient)
+    torch.testing.assert_close(faint, values)
+    for one, expected in zip(found, (kept_table, kept_weight, of_bias), strict=True):
+        torch.testing.assert_close(one, expected, rtol=1e-4, atol=1e-6)
+    if share == 1e-9:  # as good as nothing is left out
+        for one, expected in zip(found, (of_table, of_weight, of_bias), strict=True):
+            torch.testing.assert_close(one, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_a_faint_backward_pass_keeps_nan_and_bears_nothing_at_all():
+    one = scene_by_scene(field(1, 5, 5))[0]
+    places = one._cells(2 * torch.rand(40, 3) - 1)
+    given = torch.randn(75, 8), torch.randn(4, 8), torch.randn(4)
+    nothing = outputs(lambda *own: Faint.apply(*own, *places, 0.1), *given, from_=torch.zeros(40, 4))[1]
+    assert all(part.eq(0).all() for part in nothing)
+    broken = torch.zeros(40, 4)
+    broken[7, 2] = torch.nan
+    assert all(
+        part.isnan().any() for part in outputs(lambda *own: Faint.apply(*own, *places, 0.1), *given, from_=broken)[1]
+    )
+
+
+@pytest.mark.parametrize("halves", [False, True])
+@pytest.mark.parametrize("own_decoders", [False, True])
+def test_skipping_faint_samples_changes_no_rendering_and_next_to_no_gradient(own_decoders, halves):
+    assert SKIP == {"none": 0.0, "faint": 1e-3}
+    beams, found = rays(2, 60), {}
+    for skip in SKIP:
+        own = field(2, 6, 6, own_decoders)
+        renderer = Renderer(8, 8, 1.0, 10_000, skip=skip)
+        with torch.autocast("cpu", torch.bfloat16, enabled=halves):
+            values = shown(
+                renderer.render(own, beams, torch.rand(2, 60, 16, generator=torch.Generator().manual_seed(4)))
+            )
+            found[skip] = values, gradients(values, own)
+        with torch.no_grad():
+            found[skip] += (renderer.render(own, beams).rgb,)
+    (values, exact, plain), (same, faint, still) = found.values()
+    assert all(torch.equal(a, b) for a, b in zip(values, same, strict=True)) and torch.equal(plain, still)
+    for one, expected in zip(faint, exact, strict=True):
+        assert (one - expected).norm() < (6e-3 if halves else 2e-3) * expected.norm() and one.dtype == expected.dtype
+    assert not torch.equal(faint[0], exact[0])  # something was skipped

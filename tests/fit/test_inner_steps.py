@@ -321,3 +321,19 @@ def test_a_recorded_step_does_what_the_step_does(remembered):
         plain.optimizer.param_groups[0]["lr"].mul_(0.5)
     assert replayed._graph is not None
     torch.testing.assert_close(recorded.planes, field.planes, atol=1e-4, rtol=1e-3)
+
+
+def test_a_field_grows_where_it_is_empty_although_faint_samples_are_skipped():
+    losses = {}
+    for skip in ("none", "faint"):
+        field = fields(1)
+        with torch.no_grad():
+            field.planes *= 0.05
+            field.decoder.output.bias[3] = -9.0  # so empty that nothing is seen
+        steps = inner_steps(field, torch.zeros(1, 2, 3, SIZE, SIZE))  # and everything should be black
+        steps.renderer = Renderer(4, 3, 1.0, 4096, skip=skip)
+        for group in steps.optimizer.param_groups:
+            group["lr"].fill_(0.2)
+        losses[skip] = steps.run(30)[:, 0]
+    assert losses["none"][0] > 0.99 and losses["none"][-5:].mean() < 0.2
+    assert losses["faint"][-5:].mean() < 1.05 * losses["none"][-5:].mean() + 1e-3

@@ -45,6 +45,8 @@ def cost_fields(run: EvaluationRun, strategy: Strategy) -> dict[str, Any]:
     fields["timing_s"] = cost_of_a_piece(run.device) * fmean(cost["pieces"] for cost in scenes)
     fields |= model_fields(run) | {"backend": _backend(run)}
     fields["peak_mem_bytes"] = max((cost["peak_mem_bytes"] for cost in alike), default=None)
+    kept = [cost["field_bytes"] for cost in scenes]
+    fields["field_bytes"] = None if None in kept else sum(kept)
     # of the views that were fitted, not of those asked for; a run may go on from one that did not write them down
     virtual = {cost["virtual_views"] for cost in scenes if cost.get("virtual_views") is not None}
     if len(virtual) > 1:

@@ -41,7 +41,7 @@ SETTINGS = (
     *("compile", "scenes_at_once", "seed", "device"),
 )
 PARTS = ("encode_s", "denoise_s", "fit_s", "guide_s", "render_s")
-PER_SCENE = ("denoiser_calls", "field_queries")
+PER_SCENE = ("denoiser_calls", "field_queries", "field_bytes")
 
 
 @dataclass(frozen=True)

@@ -209,8 +209,15 @@ def saved_field(run: EvaluationRun, strategy: Strategy, scene_id: str) -> SavedF
 def costs(run: EvaluationRun, strategy: Strategy) -> list[dict[str, Any]]:
     """Return each scene's costs, status and verdict."""
     folder = _writer(run, strategy).folder
-    facts = [json.loads((folder / scene / SCENE).read_text()) for scene in run.scene_ids]
-    return [fact["cost"] | {"status": fact["status"], "verdict": fact.get("verdict")} for fact in facts]
+    facts = [(folder / scene, json.loads((folder / scene / SCENE).read_text())) for scene in run.scene_ids]
+    return [
+        fact["cost"] | {"status": fact["status"], "verdict": fact.get("verdict"), "field_bytes": _size(where / FIELD)}
+        for where, fact in facts
+    ]
+
+
+def _size(path: Path) -> int | None:
+    return path.stat().st_size if path.is_file() else None
 
 
 def _peak_memory(device: torch.device) -> int:

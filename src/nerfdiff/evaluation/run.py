@@ -181,7 +181,7 @@ def _load(cfg: DictConfig) -> LoadedModel:
     for name in SAMPLES:
         if cfg[name] is not None and cfg[name] < 1:
             raise ConfigError(f"{name}={cfg[name]} must be at least 1, or null for what the model was trained with")
-    renderer = {name: cfg[name] for name in ("backend", "kernel_precision", "chunk", *SAMPLES)}
+    renderer = {name: cfg[name] for name in ("backend", "kernel_precision", "skip", "chunk", *SAMPLES)}
     renderer = {name: value for name, value in renderer.items() if value is not None}
     loaded = load_model(cfg.ckpt, cfg.weights, cfg.paths.assets_dir, renderer)
     log.info("ckpt=%s", loaded.describe())
@@ -313,6 +313,7 @@ def _run(
             "precision": precision,
             "kernel_precision": cfg.kernel_precision,
             "backend": cfg.backend,
+            "skip": cfg.skip,
             "compile": cfg.compile,
             "samples": {name: getattr(loaded.model.renderer, name) for name in SAMPLES},
             "device": device.type,  # whose generators draw the noise

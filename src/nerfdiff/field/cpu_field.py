@@ -14,6 +14,9 @@ from nerfdiff.field.field import Field, TriplaneField
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.utils.precision import full_precision
 
+SKIP = {"none": 0.0, "faint": 1e-3}
+"""Choices of `Renderer.skip`, and the shares of the gradient that they may leave out."""
+
 
 class Interpolate(torch.autograd.Function):
     """Σ_p Σ_k w_pk · table[cell_p + corner_k]: over the planes p, and in each over the four corners of a cell.
@@ -33,24 +36,75 @@ class Interpolate(torch.autograd.Function):
     ) -> Float[Tensor, "n channels"]:
         ctx.save_for_backward(cells, weights, corners)
         ctx.rows = len(table)
-        rows = (cells[..., None] + corners).flatten(1)
-        return F.embedding_bag(rows, table, per_sample_weights=weights.flatten(1), mode="sum")
+        return _interpolate(table, cells, weights, corners)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, gradient: Float[Tensor, "n channels"]) -> tuple[Tensor, None, None, None]:
-        cells, weights, corners = ctx.saved_tensors
-        order = cells.flatten().sort().indices
-        counts = torch.bincount(cells.flatten(), minlength=ctx.rows)
-        first = (counts.cumsum(0) - counts).int()  # of each cell's points, once they are sorted
-        points = (order // cells.shape[1]).int()
-        weights = weights.flatten(0, 1).index_select(0, order).mT.contiguous()
-        gradient = gradient.contiguous()
-        total = gradient.new_zeros(ctx.rows, gradient.shape[1])
-        for corner, share in zip(corners.tolist(), weights, strict=True):
-            summed = F.embedding_bag(points, gradient, first, per_sample_weights=share, mode="sum")
-            total[corner:] += summed[: ctx.rows - corner]
-        return total, None, None, None
+        return _spread(gradient, *ctx.saved_tensors, ctx.rows), None, None, None
+
+
+class Faint(torch.autograd.Function):
+    """The decoder's outputs at points, with a backward pass that leaves out those whose gradients are faint.
+
+    Most of what is sampled is empty, hidden or right already: nine in ten points bring a thousandth of the gradient.
+    A point is left out where the largest of its four gradients is at most `share` of the mean over all points, so that
+    what is left out adds up to no more than `share` of all. Where a field is empty and should not be, gradients are
+    not small beside the others: it grows. The bias gets all.
+    """
+
+    @staticmethod
+    def forward(
+        ctx,
+        table: Float[Tensor, "rows hidden"],
+        weight: Float[Tensor, "4 hidden"],
+        bias: Float[Tensor, "4"],
+        cells: Int32[Tensor, "n planes"],
+        weights: Float[Tensor, "n planes 4"],
+        corners: Int32[Tensor, "4"],
+        share: float,
+    ) -> Float[Tensor, "n 4"]:
+        hidden = _interpolate(table, cells, weights, corners)
+        ctx.save_for_backward(hidden, weight, cells, weights, corners)
+        ctx.rows, ctx.share = len(table), share
+        return torch.addmm(bias[:, None], weight, F.silu(hidden).mT).mT
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient: Float[Tensor, "n 4"]) -> tuple[Tensor | None, ...]:
+        with full_precision(gradient.device):
+            return *Faint._gradients(gradient, *ctx.saved_tensors, ctx.rows, ctx.share), None, None, None, None
+
+    @staticmethod
+    def _gradients(gradient, hidden, weight, cells, weights, corners, rows, share) -> tuple[Tensor, Tensor, Tensor]:
+        most = gradient.mT.abs().amax(0)
+        kept = torch.nonzero(~(most <= share * most.mean()))[:, 0]  # NaN is not faint
+        hidden, cells, weights, some = (part[kept] for part in (hidden, cells, weights, gradient))
+        before = torch.ops.aten.silu_backward(some @ weight, hidden)
+        return _spread(before, cells, weights, corners, rows), some.mT @ F.silu(hidden), gradient.sum(0)
+
+
+def _interpolate(table: Tensor, cells: Tensor, weights: Tensor, corners: Tensor) -> Float[Tensor, "n channels"]:
+    rows = (cells[..., None] + corners).flatten(1)
+    # detached: what a table that needs gradients has PyTorch note down for them is not used here
+    return F.embedding_bag(rows, table.detach(), per_sample_weights=weights.flatten(1), mode="sum")
+
+
+def _spread(
+    gradient: Float[Tensor, "n channels"], cells: Tensor, weights: Tensor, corners: Tensor, rows: int
+) -> Float[Tensor, "rows channels"]:
+    """Return the gradient of `Interpolate`'s table."""
+    order = cells.flatten().sort().indices
+    counts = torch.bincount(cells.flatten(), minlength=rows)
+    first = (counts.cumsum(0) - counts).int()  # of each cell's points, once they are sorted
+    points = (order // cells.shape[1]).int()
+    weights = weights.flatten(0, 1).index_select(0, order).mT.contiguous()
+    gradient = gradient.contiguous()
+    total = gradient.new_zeros(rows, gradient.shape[1])
+    for corner, share in zip(corners.tolist(), weights, strict=True):
+        summed = F.embedding_bag(points, gradient, first, per_sample_weights=share, mode="sum")
+        total[corner:] += summed[: rows - corner]
+    return total
 
 
 def suits(field: Field, rays: Rays) -> bool:
@@ -69,8 +123,12 @@ def suits(field: Field, rays: Rays) -> bool:
     )
 
 
-def scene_by_scene(field: TriplaneField) -> list["CpuField"]:
-    """Return one field for each scene of a batch: the texels of one scene fit a core's cache."""
+def scene_by_scene(field: TriplaneField, faint: float = 0.0) -> list["CpuField"]:
+    """Return one field for each scene of a batch: the texels of one scene fit a core's cache.
+
+    Args:
+        faint: see `CpuField`.
+    """
     triplane, hidden, output = field.triplane, field.decoder.hidden, field.decoder.output
     with full_precision(triplane.planes.device):
         texels = triplane.planes.permute(0, 1, 3, 4, 2).flatten(1, 3)
@@ -82,7 +140,7 @@ def scene_by_scene(field: TriplaneField) -> list["CpuField"]:
         alone = Triplane(triplane.planes[one], triplane.cameras[one], triplane.near[one], triplane.far[one])
         own = output.weight.ndim == 3  # a decoder for each scene
         weight, bias = (parameter[scene] if own else parameter for parameter in (output.weight, output.bias))
-        fields.append(CpuField(TriplaneField(alone, field.decoder), table, weight, bias))
+        fields.append(CpuField(TriplaneField(alone, field.decoder), table, weight, bias, faint))
     return fields
 
 
@@ -97,12 +155,14 @@ class CpuField:
         field: of one scene.
         table: its texels after the decoder's hidden layer, before the activation.
         weight, bias: of the decoder's output layer.
+        faint: share of the gradient that may be left out, see `Faint`; 0 leaves nothing out.
     """
 
     field: TriplaneField
     table: Float[Tensor, "texels hidden"]
     weight: Float[Tensor, "4 hidden"]
     bias: Float[Tensor, "4"]
+    faint: float = 0.0
 
     def __call__(
         self, points: Float[Tensor, "1 n 3"], directions: Float[Tensor, "1 n 3"] | None = None
@@ -110,10 +170,16 @@ class CpuField:
         """See `Field`; the colour is the same from all directions."""
         with full_precision(points.device):
             coordinates, valid = self.field.triplane.frustum_coordinates(points)
-            hidden = F.silu(Interpolate.apply(self.table, *self._cells(coordinates[0])))
-            out = torch.addmm(self.bias[:, None], self.weight, hidden.mT)  # each of 4 numbers in a row of its own
-        rgb, density = self.field.decoder.activated(out.mT[None])
+            out = self._outputs(*self._cells(coordinates[0]))
+        rgb, density = self.field.decoder.activated(out[None])
         return rgb, self.field.per_scene_unit(density, valid)
+
+    def _outputs(self, *interpolation: Tensor) -> Float[Tensor, "n 4"]:
+        if self.faint > 0 and torch.is_grad_enabled():
+            return Faint.apply(self.table, self.weight, self.bias, *interpolation, self.faint)
+        hidden = Interpolate.apply(self.table, *interpolation)
+        hidden = F.silu(hidden, inplace=not torch.is_grad_enabled())
+        return torch.addmm(self.bias[:, None], self.weight, hidden.mT).mT  # each of 4 numbers in a row of its own
 
     def _cells(
         self, coordinates: Float[Tensor, "n 3"]

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from safetensors.torch import save_file
 from nerfdiff.cameras import Cameras
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.triplane import Triplane
+from nerfdiff.fit.compact_planes import compact, restored
 from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.render.renderer import Renderer
 from nerfdiff.trajectories import Upright
@@ -22,8 +24,9 @@ from nerfdiff.utils.files import atomic
 FIELD = "field.safetensors"
 STEPS = "steps"
 """Folder beside a field: fields from on the way to it, called after how many steps of distillation had been done."""
-FORMAT = 1
-MACHINES = ("backend", "kernel_precision")
+FORMAT = 2
+"""1 had planes in float32 alone."""
+MACHINES = ("backend", "kernel_precision", "skip")
 """Settings of the renderer that suit a machine, not a field."""
 
 
@@ -42,8 +45,8 @@ class SavedField:
     stands: Upright | None = None
 
 
-def save_field(path: str | Path, saved: SavedField, dtype: torch.dtype = torch.float32) -> None:
-    """Write planes and decoder as `dtype`, and the rest as JSON in the file's header (key `nerfdiff`).
+def save_field(path: str | Path, saved: SavedField) -> None:
+    """Write planes as small as `compact` makes them, the decoder as float32, and the rest as JSON in the header.
 
     Raises:
         DataError: the file cannot be written.
@@ -52,6 +55,7 @@ def save_field(path: str | Path, saved: SavedField, dtype: torch.dtype = torch.f
     header = {
         "format": FORMAT,
         "camera": {"K": field.cameras.K[0].tolist(), "height": field.cameras.height, "width": field.cameras.width},
+        "planes": list(field.planes.shape),
         "near": float(field.near),
         "far": float(field.far),
         "decoder": field.decoder.settings,
@@ -59,7 +63,9 @@ def save_field(path: str | Path, saved: SavedField, dtype: torch.dtype = torch.f
     }
     if saved.stands is not None:
         header["stands"] = {"point": saved.stands.point.tolist(), "up": saved.stands.up.tolist()}
-    state = {name: value.detach().to("cpu", dtype).contiguous() for name, value in field.state_dict().items()}
+    decoder = {name: value for name, value in field.state_dict().items() if name != "planes"}
+    state = decoder | compact(field, saved.renderer, saved.stands)
+    state = {name: value.detach().cpu().contiguous() for name, value in state.items()}
     header["sha256"] = _digest(state)
     with atomic(Path(path)) as temporary:
         save_file(state, temporary, {"nerfdiff": json.dumps(header)})
@@ -75,21 +81,24 @@ def load_field(path: str | Path) -> SavedField:
         with safe_open(path, framework="pt") as file:
             header = json.loads(file.metadata()["nerfdiff"])
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, it is no mapping
-        if header["format"] != FORMAT:
-            raise DataError(f"{path}: format {header['format']!r}, expected {FORMAT}; distil the scene again")
+        if header["format"] not in range(1, FORMAT + 1):
+            raise DataError(f"{path}: format {header['format']!r}, expected at most {FORMAT}; update this project")
         if header.get("sha256", digest := _digest(state)) != digest:  # fields from before have none
             raise DataError(f"{path}: its bytes changed since it was written; copy it anew, or distil the scene again")
         camera = header["camera"]
         cameras = Cameras(torch.eye(4)[None], torch.tensor([camera["K"]]), camera["height"], camera["width"])
         bounds = (torch.tensor([header[name]]) for name in ("near", "far"))
-        field = RefinedField(Triplane(state["planes"], cameras, *bounds), Decoder(**header["decoder"]))
-        field.load_state_dict(state)
+        planes = restored(state, header.get("planes", ()))  # which old files have as they are
+        field = RefinedField(Triplane(planes, cameras, *bounds), Decoder(**header["decoder"]))
+        field.decoder.load_state_dict(
+            {name.removeprefix("decoder."): value for name, value in state.items() if name.startswith("decoder.")}
+        )
         stands = header.get("stands")
         stands = stands and Upright(torch.tensor(stands["point"]), torch.tensor(stands["up"]))
         return SavedField(field, Renderer(**header["render"]), stands)
     except DataError:
         raise
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError, zlib.error) as error:
         raise DataError(
             f"{path}: not a field saved by this project ({type(error).__name__}: {error}); distil the scene again"
         ) from error

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfdiff.cameras import Rays
+from nerfdiff.field.cpu_field import SKIP
 from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.field import Field, TriplaneField
 from nerfdiff.render.agreement import Probe, disagreement, in_any_order
@@ -46,9 +47,9 @@ _failures: dict[tuple, str] = {}
 _trusted: set[tuple] = set()
 
 
-def check_choice(backend: str, kernel_precision: str) -> None:
-    """Raise ConfigError unless both are known."""
-    known = (("backend", backend, BACKENDS), ("kernel_precision", kernel_precision, PRECISIONS))
+def check_choice(backend: str, kernel_precision: str, skip: str) -> None:
+    """Raise ConfigError unless all are known."""
+    known = (("backend", backend, BACKENDS), ("kernel_precision", kernel_precision, PRECISIONS), ("skip", skip, SKIP))
     for name, choice, choices in known:
         if choice not in choices:
             raise ConfigError(f"{name}={choice!r}: choose {', '.join(choices)}")

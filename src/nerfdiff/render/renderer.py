@@ -83,9 +83,11 @@ class Renderer:
         least_transmittance: kernels follow a ray no further than to where uniform samples let less of the light pass.
             Colours and opacities lack about as much, gradients up to fifty times as much of their length (measured);
             0 follows rays to their ends, as the reference does.
+        skip: what a CPU leaves out of the backward pass of a triplane: `none`, or `faint`: samples whose gradients
+            together are less than a thousandth of all (`field.cpu_field.Faint`). Renderings are the same, bit for bit.
 
     Raises:
-        ConfigError: another `backend` or `kernel_precision`, or a `least_transmittance` outside [0, 1).
+        ConfigError: another `backend`, `kernel_precision` or `skip`, or a `least_transmittance` outside [0, 1).
     """
 
     uniform_samples: int
@@ -95,9 +97,10 @@ class Renderer:
     backend: str = "auto"
     kernel_precision: str = "auto"
     least_transmittance: float = 0.0
+    skip: str = "none"
 
     def __post_init__(self):
-        check_choice(self.backend, self.kernel_precision)
+        check_choice(self.backend, self.kernel_precision, self.skip)
         if not 0 <= self.least_transmittance < 1:
             raise ConfigError(
                 f"least_transmittance={self.least_transmittance}: expected 0 (exact) or more, less than 1"
@@ -141,7 +144,9 @@ class Renderer:
             return Rendering(*self._in_chunks(field, parts, keep_coarse, recompute))
         outputs = [
             self._in_chunks(alone, own, keep_coarse, recompute)
-            for alone, own in zip(cpu_field.scene_by_scene(field), _split(parts, 1, 0), strict=True)
+            for alone, own in zip(
+                cpu_field.scene_by_scene(field, cpu_field.SKIP[self.skip]), _split(parts, 1, 0), strict=True
+            )
         ]
         return Rendering(*_joined(outputs, axis=0))
 

@@ -21,7 +21,7 @@ from nerfdiff.utils.errors import DataError
 log = logging.getLogger(__name__)
 
 TIMINGS = ("scene_s", "distill_s", "denoise_s", "fit_s", "guide_s", "encode_s", "render_s")
-COUNTS = ("denoiser_calls", "field_queries")  # of all scenes of a run; a table has them per scene
+COUNTS = ("denoiser_calls", "field_queries", "field_bytes")  # of all scenes of a run; a table has them per scene
 SIZES = ("peak_mem_bytes", "params", "timing_s")
 COSTS = (*TIMINGS, *COUNTS, *SIZES)
 IDENTITY = (

@@ -93,7 +93,8 @@ class ResultRow(make_dataclass("_Measured", _NUMBERS, bases=(_Identity,), kw_onl
     predicted views, whatever the method; `distill_s` is that without encoding the image and rendering the views, of
     methods that call the denoiser; `denoise_s` (denoiser calls), `fit_s` (field updates) and `guide_s` (renderings of
     virtual views, which the denoiser sees and is guided by) are parts of it. `timing_s` are the seconds per scene that
-    measuring cost the run. `peak_mem_bytes` is what a GPU had allocated; on a CPU the process's resident set, with what
+    measuring cost the run. `field_bytes` are of all scenes' fields, as
+    they are stored. `peak_mem_bytes` is what a GPU had allocated; on a CPU the process's resident set, with what
     earlier jobs of a sweep left in it. `backend` is what rendered: `triton`, `torch`, or `cpu`, which is PyTorch in the
     order that suits a CPU. `samples_per_ray` counts coarse and fine ones. `K` counts the virtual views that fields were
     fitted to, the most of any scene. `fid_n` is the number of images on either side of `fid` and `fd_st_vgg`; `n_views`
@@ -128,6 +129,7 @@ class ResultRow(make_dataclass("_Measured", _NUMBERS, bases=(_Identity,), kw_onl
     steps_median: float | None = None
     steps_planned: int | None = None
     stopped_by: str | None = None
+    field_bytes: int | None = None
     peak_mem_bytes: int | None = None
     params: int | None = None
     # environment

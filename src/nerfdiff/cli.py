@@ -26,7 +26,7 @@ from nerfdiff.inputs import CHECKOUT, CONF, check_inputs, check_output
 from nerfdiff.limits import check_limit, check_limits
 from nerfdiff.noise import quieten
 from nerfdiff.quoting import gather_lists, parse_override, quote_values
-from nerfdiff.stopping import Stopped, leave, on_signals, stop
+from nerfdiff.stopping import Stopped, in_a_job, leave, on_signals, stop
 from nerfdiff.utils.errors import ConfigError, UserError, is_out_of_memory
 from nerfdiff.utils.hashes import sha256_values
 from nerfdiff.utils.memory import keep_freed_memory
@@ -77,7 +77,8 @@ def entry_point(config_name: str, *inputs: str) -> Callable[[Callable[[DictConfi
         def run(cfg: DictConfig) -> object:
             quieten()
             try:
-                return function(cfg)
+                with in_a_job():
+                    return function(cfg)
             except Exception as error:
                 message = explain(error, cfg)
                 if message is None or os.environ.get("HYDRA_FULL_ERROR") == "1":

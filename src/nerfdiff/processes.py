@@ -10,6 +10,8 @@ from subprocess import Popen
 import torch
 from lightning.fabric.strategies.launchers import subprocess_script
 
+from nerfdiff.utils.rank import is_first
+
 GRACE = 10.0
 """Seconds that a process has to notice another's death by itself and to end with words of its own."""
 _PARENT = os.getppid()
@@ -26,7 +28,7 @@ def watch() -> None:
 
 def is_launched() -> bool:
     """Return true if this process was launched to help another."""
-    return int(os.environ.get("LOCAL_RANK", 0)) > 0
+    return not is_first()
 
 
 def end_launched(signum: int) -> None:
@@ -46,11 +48,12 @@ def lost_process(error: RuntimeError) -> str | None:
     time.sleep(0.2)  # it is heard of before the system knows how it ended
     if is_launched() and os.getppid() == _PARENT:
         sys.exit(1)  # the first process will say it
-    return _sentence()
+    return gone()
 
 
-def _sentence() -> str:
-    if is_launched():
+def gone() -> str:
+    """A sentence on the process that is gone, as far as this one knows of it."""
+    if is_launched() and os.getppid() != _PARENT:
         return "The first process of this run ended."
     for rank, process in enumerate(_launched, 1):
         if code := process.poll():
@@ -72,7 +75,7 @@ class _Observer(subprocess_script._ChildProcessObserver):
             return all(code == 0 for code in codes)
         if torch.distributed.is_initialized() and torch.distributed.get_backend() != "gloo":
             time.sleep(GRACE)
-            print(f"error: {_sentence()} The same command goes on from the last checkpoint.", file=sys.stderr)
+            print(f"error: {gone()} The same command goes on from the last checkpoint.", file=sys.stderr)
             for process in self._child_processes:
                 process.kill()
             os._exit(1)
@@ -83,5 +86,5 @@ def _end_with_parent() -> None:
     while os.getppid() == _PARENT:
         time.sleep(1)
     time.sleep(GRACE)
-    print(f"error: {_sentence()} The same command goes on.", file=sys.stderr)
+    print(f"error: {gone()} The same command goes on.", file=sys.stderr)
     os._exit(1)

@@ -18,6 +18,7 @@ from nerfdiff.data.scene import MissingSplit, SceneReader
 from nerfdiff.data.views import EvaluationScenes, TrainingViews
 from nerfdiff.stopping import ignore_signals
 from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.shard import Shard
 from nerfdiff.utils.spread import spread
 
 log = logging.getLogger(__name__)
@@ -128,6 +129,7 @@ class SceneDataModule(LightningDataModule):
         self.train_reader: SceneReader | None = None
         self.val_set: EvaluationScenes | None = None
         self.test_set: EvaluationScenes | None = None
+        self.shard: Shard | None = None  # of the test scenes; None: all
 
     @cached_property
     def _trained_on(self) -> dict[str, str]:
@@ -170,7 +172,11 @@ class SceneDataModule(LightningDataModule):
             self.val_set = self._validation_scenes()
         else:
             self.test_set = EvaluationScenes(
-                self.reader("test"), self.source_view, scenes=self.eval_scenes, stride=self.eval_stride
+                self.reader("test"),
+                self.source_view,
+                scenes=self.eval_scenes,
+                stride=self.eval_stride,
+                shard=self.shard,
             )
 
     def train_dataloader(self) -> DataLoader:

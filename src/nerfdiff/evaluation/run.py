@@ -28,6 +28,8 @@ from nerfdiff.stress.stress import Stress, row_fields, stress_of
 from nerfdiff.utils.config import auto_precision, plain
 from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.hashes import sha256_file, sha256_values
+from nerfdiff.utils.shard import Shard
+from nerfdiff.utils.spread import spread
 
 log = logging.getLogger(__name__)
 
@@ -64,6 +66,7 @@ class RunSettings:
         minutes: after which no scene begins.
         progress_every: seconds between lines where there is no terminal.
         per_scene: leave every scene's field, trace and orbit beside its views.
+        shard: of the scenes, that this run makes; None: all.
         stress, severity, neutral: what goes wrong on purpose, by how much, and how much is nothing; None: nothing.
     """
 
@@ -79,6 +82,7 @@ class RunSettings:
     per_scene: bool
     orbit: Orbit
     sheet: Sheet
+    shard: Shard | None
     stress: str | None
     severity: float | None
     neutral: float | None
@@ -95,6 +99,7 @@ class RunSettings:
             compiled=cfg.compile != "none",
             orbit=instantiate(cfg.orbit),
             sheet=instantiate(cfg.sheet),
+            shard=Shard.read(cfg.shard),
             **row_fields(stress_of(cfg)),
         )
 
@@ -105,6 +110,8 @@ class EvaluationRun:
 
     Args:
         load: reads the scenes of these ids, in batches of one.
+        scene_ids: of this run's scenes.
+        split_ids: of all scenes, of which a shard has a part.
         identity: all settings that predictions depend on.
         folder: holds all files of the run.
         stability: of the model's training, see `LoadedModel`.
@@ -121,6 +128,7 @@ class EvaluationRun:
     model: NerfDiff
     load: Callable[[Sequence[str]], Iterable[ViewBatch]]
     scene_ids: list[str]
+    split_ids: list[str]
     device: torch.device
     precision: str
     identity: dict[str, Any]
@@ -139,7 +147,7 @@ class EvaluationRun:
 
     def stressed(self, strategy: Strategy) -> Strategy:
         """Return the strategy with this run's stress, where it acts on virtual views or targets."""
-        return strategy if self.stress is None else self.stress.strategy(strategy, self.load, self.scene_ids)
+        return strategy if self.stress is None else self.stress.strategy(strategy, self.load, self.split_ids)
 
     def autocast(self) -> AbstractContextManager:
         return autocast(self.device, self.precision)
@@ -191,12 +199,14 @@ def dataset_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
     """
     loaded = _load(cfg)
     datamodule = instantiate(cfg.data)
+    datamodule.shard = None if (stress := stress_of(cfg)) is not None else Shard.read(cfg.shard)
     datamodule.setup("test")
     reader = datamodule.reader("test")
-    scene_ids = [reader.scene_id(index) for index in datamodule.test_set.indices]
-    if (stress := stress_of(cfg)) is not None:
+    split_ids = [reader.scene_id(index) for index in spread(len(reader), datamodule.eval_scenes)]
+    if stress is not None:  # which may show a scene another one's images
         stress.inputs(datamodule.test_set)
-    position = {name: index for index, name in enumerate(scene_ids)}
+    position = {reader.scene_id(index): place for place, index in enumerate(datamodule.test_set.indices)}
+    scene_ids = split_ids if (shard := Shard.read(cfg.shard)) is None else list(shard.share(split_ids))
 
     def load(names: Sequence[str]) -> Iterable[ViewBatch]:
         return datamodule.scenes([position[name] for name in names])
@@ -209,14 +219,16 @@ def dataset_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
             f"set data.image_size=[{loaded.image_size[0]},{loaded.image_size[1]}]"
         )
     facts = {
-        "split_sha256": sha256_values(scene_ids),
+        "split_sha256": sha256_values(split_ids),
         "files_sha256": reader.fingerprint(),
         "reader": reader.identity,
         "views": [cfg.data.source_view, cfg.data.eval_stride],
         "image_size": size,
         "mean_image_scenes": cfg.get("mean_image_scenes"),  # a baseline of evaluate.py
     }
-    return _run(cfg, device, loaded, load, scene_ids, facts, datamodule, stress)
+    if shard is not None:
+        facts["shard"] = str(shard)
+    return _run(cfg, device, loaded, load, scene_ids, split_ids, facts, datamodule, stress)
 
 
 def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
@@ -229,6 +241,8 @@ def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
     size = loaded.image_size or plain(cfg.picture_size)
     if size is None:
         raise ConfigError(f"{loaded.path} does not say what image size it is for: give picture_size=[height,width]")
+    if cfg.shard is not None:
+        raise ConfigError(f"shard={cfg.shard} is of a dataset's scenes, and image={cfg.image} is one picture")
     if (stress := stress_of(cfg)) is not None and stress.input_view is not None:
         raise ConfigError(f"stress={stress.axis} chooses another input view, and a picture has none")
     scene = picture_scene(cfg, size)
@@ -239,7 +253,8 @@ def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
         "picture_views": plain(cfg.picture_views),
         "image_size": list(size),
     }
-    return _run(cfg, device, loaded, lambda names: [scene] * len(names), list(scene.scene_ids), facts, None, stress)
+    ids = list(scene.scene_ids)
+    return _run(cfg, device, loaded, lambda names: [scene] * len(names), ids, ids, facts, None, stress)
 
 
 def picture_scene(cfg: DictConfig, size: Sequence[int], where: np.ndarray | None = None) -> ViewBatch:
@@ -265,6 +280,7 @@ def _run(
     loaded: LoadedModel,
     load: Callable[[Sequence[str]], Iterable[ViewBatch]],
     scene_ids: list[str],
+    split_ids: list[str],
     facts: dict[str, Any],
     data: SceneDataModule | None,
     stress: Stress | None,
@@ -305,6 +321,7 @@ def _run(
         model=model,
         load=load if stress is None else stress.on(load),
         scene_ids=scene_ids,
+        split_ids=split_ids,
         device=device,
         precision=precision,
         identity=identity,

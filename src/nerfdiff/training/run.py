@@ -10,6 +10,7 @@ import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from lightning import Trainer, seed_everything
+from lightning.fabric.plugins.environments import SLURMEnvironment, TorchElasticEnvironment
 from omegaconf import DictConfig
 
 from nerfdiff.checkpoint import (
@@ -22,6 +23,7 @@ from nerfdiff.checkpoint import (
     last_checkpoint,
     load_model,
     read_checkpoint,
+    steps_of,
 )
 from nerfdiff.compilation import compile_unets
 from nerfdiff.data.datamodule import SceneDataModule
@@ -42,6 +44,7 @@ from nerfdiff.utils.config import auto_precision, plain
 from nerfdiff.utils.errors import CheckpointError, ConfigError, ProcessLost, TrainingDiverged
 from nerfdiff.utils.files import held, remove_leftovers
 from nerfdiff.utils.hashes import sha256_file, sha256_values
+from nerfdiff.utils.rank import set_rank
 
 log = logging.getLogger(__name__)
 
@@ -68,6 +71,7 @@ def train(cfg: DictConfig) -> dict[str, float]:
     cfg, trainer = with_stress(cfg, "train"), None
     try:
         trainer = build_trainer(cfg)
+        set_rank(trainer.global_rank)
         with held(Path(cfg.paths.output_dir)) if trainer.is_global_zero else nullcontext():
             found = _train(cfg, trainer)
     except Exception as error:
@@ -104,8 +108,9 @@ def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
         _begin(module, cfg, model_config)
     compile_unets(module.model, cfg.compile, cfg.paths.compiled_dir)
     _announce(module, last, trainer.strategy.root_device)
-    if trainer.is_global_zero and last is not None and last.name != LAST and (last.parent / LAST).exists():
-        os.replace(last.parent / LAST, last.parent / DAMAGED)  # else it would take the place of the one that is good
+    damaged = output_dir / "checkpoints" / LAST
+    if trainer.is_global_zero and last is not None and damaged.exists() and steps_of(damaged) is None:
+        os.replace(damaged, damaged.with_name(DAMAGED))  # else it would take the place of the one that is good
 
     try:
         trainer.fit(module, datamodule, ckpt_path=last, weights_only=True)
@@ -186,7 +191,9 @@ def build_trainer(cfg: DictConfig) -> Trainer:
                 *(instantiate(callback) for callback in wanted.values() if callback is not None),
             ],
             enable_progress_bar=cfg.callbacks.get("progress") is not None,
-            plugins=[ClearCheckpointIO()],
+            plugins=[ClearCheckpointIO(), *_scheduler()],
+            # where Lightning looks for checkpoints that a scheduler made it write: not among those of other runs
+            default_root_dir=cfg.paths.output_dir,
             # Lightning counts batches where we count optimizer steps.
             val_check_interval=cfg.validation_every * cfg.trainer.accumulate_grad_batches,
             check_val_every_n_epoch=None,
@@ -194,6 +201,13 @@ def build_trainer(cfg: DictConfig) -> Trainer:
         )
     except InstantiationException as error:
         raise ConfigError(f"the trainer cannot be set up: {error.__cause__ or error}") from error
+
+
+def _scheduler() -> list[SLURMEnvironment]:
+    """Under Slurm's srun, its environment without Lightning's queueing again, which saves within steps."""
+    if TorchElasticEnvironment.detect() or not SLURMEnvironment.detect():
+        return []
+    return [SLURMEnvironment(auto_requeue=False)]
 
 
 def _checkpoint_to_resume(output_dir: Path, cfg: DictConfig, model_config: dict, data: SceneDataModule) -> Path | None:

@@ -367,15 +367,18 @@ def test_submitits_jobs_are_queued_again_by_submitit_alone(scontrol, monkeypatch
         called.append(signum)
         sys.exit(-1)
 
+    def job(signum):
+        with in_a_job():
+            os.kill(os.getpid(), signum)
+            time.sleep(1)
+
     before = [signal.signal(signal.SIGUSR2, requeue), signal.signal(signal.SIGTERM, signal.SIG_IGN)]
     try:
         signal.signal(signal.SIGTERM, lambda *_: called.append("passed by"))
-        with pytest.raises(SystemExit), in_a_job():
-            os.kill(os.getpid(), signal.SIGUSR2)
-            time.sleep(1)
-        with pytest.raises(Stopped), in_a_job():
-            os.kill(os.getpid(), signal.SIGTERM)
-            time.sleep(1)
+        with pytest.raises(SystemExit):
+            job(signal.SIGUSR2)
+        with pytest.raises(Stopped):
+            job(signal.SIGTERM)
     finally:
         signal.signal(signal.SIGUSR2, before[0])
         signal.signal(signal.SIGTERM, before[1])

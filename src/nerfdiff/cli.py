@@ -130,6 +130,7 @@ def job_folder(swept: str, overrides: Sequence[str] = ()) -> str:
 
 
 OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
+OmegaConf.register_new_resolver("all_shards", lambda of: ",".join(f"{n}/{of}" for n in range(1, of + 1)), replace=True)
 
 
 def explain(error: BaseException, cfg: DictConfig | None = None) -> str | None:

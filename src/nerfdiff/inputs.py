@@ -73,7 +73,7 @@ def check_inputs(
             if not Path(value).is_dir():
                 raise DataError(f"shards={value}: no such folder; name the one in which the shards were made")
         elif key == "data.root":
-            if not Path(value).is_dir():
+            if not OmegaConf.select(cfg, "data.shards") and not Path(value).is_dir():
                 raise DataError(f"data.root={value}: no such folder; set data.root to the folder of the dataset")
         elif key == "results":
             for place in [value] if isinstance(value, str) else value:

@@ -50,11 +50,16 @@ class Stopped(BaseException):
 def on_signals(act: Callable[[int], None]) -> Iterator[None]:
     """Call `act` with the number of each signal that asks this process to end, instead of what was to happen.
 
-    Signals that are ignored stay so, as SIGHUP is under nohup.
+    Signals that are ignored stay so, as SIGHUP is under nohup. One that comes while the former handlers are put back
+    is theirs: a scheduler sends several at once.
     """
+    ended, late = False, []
 
     def handle(signum: int, frame: FrameType | None) -> None:
-        act(signum)
+        if ended:
+            late.append(signum)
+        else:
+            act(signum)
 
     before = {number: signal.getsignal(number) for number in SIGNALS}
     before = {number: handler for number, handler in before.items() if handler is not signal.SIG_IGN}
@@ -63,8 +68,11 @@ def on_signals(act: Callable[[int], None]) -> Iterator[None]:
     try:
         yield
     finally:
+        ended = True
         for number, handler in before.items():
             signal.signal(number, handler)
+        for number in late:
+            signal.raise_signal(number)
 
 
 def stop(signum: int) -> None:

@@ -1,20 +1,20 @@
 """Distillation and evaluation in shards, and their merging: what one run of all scenes gives."""
 
 import csv
-import dataclasses
-import json
 import shutil
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 
-from nerfdiff.cli import load_config
+from nerfdiff.cli import CONF, load_config
 from nerfdiff.evaluation.distill import distill
 from nerfdiff.evaluation.evaluate import evaluate
 from nerfdiff.evaluation.merge import _ranges, merge_shards
 from nerfdiff.metrics.sets import FrechetDistance, add_statistics, write_statistics
 from nerfdiff.results.frame import read_runs
 from nerfdiff.results.row import read_rows
+from nerfdiff.sweeps.merged import MergeShards
 from nerfdiff.utils.errors import ConfigError, DataError
 from nerfdiff.utils.shard import Shard
 from training_fixtures import evaluation_overrides, train_to_evaluate, write_dataset
@@ -106,6 +106,19 @@ def test_merging_again_adds_nothing_and_a_shard_made_twice_counts_once(data, run
     assert (shards / "table.md").is_file()
 
 
+def test_a_sweep_of_shards_has_a_job_for_each_and_merges_them_at_its_end(shards):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        words = ["ckpt=demo", "sweep=shards", "shards=3", f"hydra.sweep.dir={shards}"]
+        sweep = compose("distill", words, return_hydra_config=True)
+    assert sweep.hydra.sweeper.params.shard == "1/3,2/3,3/3" and sweep.hydra.sweeper.batch_size is None
+    MergeShards().on_multirun_end(sweep)
+    assert read_rows(shards / "results.jsonl")[-1].n_scenes == 5
+    for path in shards.glob("*/scores/none/shard.json"):
+        path.unlink()
+    with pytest.raises(SystemExit, match="no complete shard"):
+        MergeShards().on_multirun_end(sweep)
+
+
 def test_a_shard_that_is_missing_is_named_and_nothing_is_merged(data, run, shards):
     shutil.rmtree(
         next(path.parents[2] for path in shards.glob("*/scores/none/shard.json") if '"1/2"' in path.read_text())
@@ -170,7 +183,10 @@ def test_all_shards_are_all_scenes_once():
     items = list(range(103))
     for of in (1, 7, 100, 103):
         shares = [Shard(number, of).share(items) for number in range(1, of + 1)]
-        assert sorted(sum(shares, [])) == items and max(map(len, shares)) - min(map(len, shares)) <= 1
+        assert (
+            sorted(item for share in shares for item in share) == items
+            and max(map(len, shares)) - min(map(len, shares)) <= 1
+        )
         assert all(Shard(n + 1, of).index(p) == item for n, s in enumerate(shares) for p, item in enumerate(s))
     assert _ranges([1, 2, 3, 7, 9, 10]) == "1-3,7,9-10"
 

@@ -56,9 +56,9 @@ class Part:
 def merge_shards(cfg: DictConfig) -> list[ResultRow]:
     """Merge the shards below `cfg.shards`, of every run and strategy there that has them all.
 
-    Leaves in `<cfg.out>/<strategy>-<identity>/scores/<strategy>/` what a run of all scenes leaves: per_scene.csv, in the
-    order of shards, and summary.json. Appends a row to `cfg.results`, unless it is there. Scores of images stay with
-    their shards.
+    Leaves in `<cfg.out>/<strategy>-<identity>/scores/<strategy>/` what a run of all scenes leaves: per_scene.csv, in
+    the order of shards, and summary.json. Appends a row to `cfg.results`, unless it is there. Scores of images stay
+    with their shards.
 
     Raises:
         DataError: no run there has all its shards (the message says which are missing), or files are damaged.

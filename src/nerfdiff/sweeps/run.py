@@ -13,6 +13,7 @@ from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig, open_dict
 
 from nerfdiff.results.row import RESULTS, ResultRow, RowFile
+from nerfdiff.sweeps.cluster import JobDied, every_result
 from nerfdiff.sweeps.jobs import results_of
 from nerfdiff.sweeps.plan import write_plan
 from nerfdiff.sweeps.proposals import Proposals
@@ -133,12 +134,16 @@ class Run:
         for job in {job[: len(job) - bool(self.space.seeds)]: job for job in batch}.values():
             self.load(self.config, self._words(job))
 
-    def _launch(self, batch: Sequence[Job]) -> list[JobReturn]:
-        """Run a batch. Where the launcher itself fails, a job took its process along: then one job after the other."""
+    def _launch(self, batch: Sequence[Job], again: bool = False) -> list[JobReturn]:
+        """Run a batch. Where the launcher itself fails, a job took its process along: then one job after the other.
+
+        Jobs of a cluster that died without leaving a row are run `again`, together and once.
+        """
         before = self._rows()
         self.attempted.update(batch)
         try:
-            results = self.launcher.launch([self._words(job) for job in batch], initial_job_idx=self.launched)
+            with every_result(self.launcher):
+                results = self.launcher.launch([self._words(job) for job in batch], initial_job_idx=self.launched)
         except Exception as error:
             if len(batch) == 1:
                 self._record(batch[0], error)
@@ -153,12 +158,23 @@ class Run:
                     returns += self._launch([job])
             return returns
         self.launched += len(batch)
+        died: dict[Job, Exception] = {}
         for job, result in zip(batch, results, strict=True):
             try:
                 _ = result.return_value
+            except JobDied as error:
+                died[job] = error
             except Exception as error:
                 self.failures.append(f"{' '.join(set(job) & self.space.varied)} ({error})")
-        return list(results)
+        rows = self._rows()
+        lost = [job for job in died if len(rows.get(frozenset(job), ())) == len(before.get(frozenset(job), ()))]
+        returns = [result for job, result in zip(batch, results, strict=True) if job not in lost]
+        if lost and not again:
+            log.warning("%d of %d jobs died and are run again: %s", len(lost), len(batch), died[lost[0]])
+            return returns + self._launch(lost, again=True)
+        for job in lost:
+            self._record(job, died[job])
+        return returns
 
     def _record(self, job: Job, error: Exception) -> None:
         """A row for a job whose process is gone."""

@@ -48,6 +48,8 @@ from nerfdiff.utils.rank import set_rank
 
 log = logging.getLogger(__name__)
 
+PAPERS = 1e8  # parameters from which a model is of the paper's sizes
+
 
 def train(cfg: DictConfig) -> dict[str, float]:
     """Train, or go on training, the run of `cfg.paths.output_dir`.
@@ -107,7 +109,7 @@ def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
     if last is None:
         _begin(module, cfg, model_config)
     compile_unets(module.model, cfg.compile, cfg.paths.compiled_dir)
-    _announce(module, last, trainer.strategy.root_device)
+    _announce(module, last, trainer, datamodule.batch_size)
     damaged = output_dir / "checkpoints" / LAST
     if trainer.is_global_zero and last is not None and damaged.exists() and steps_of(damaged) is None:
         os.replace(damaged, damaged.with_name(DAMAGED))  # else it would take the place of the one that is good
@@ -249,7 +251,7 @@ def _sound(output_dir: Path) -> str:
     return f"{describe(last)} Its weights are finite: the same command goes on from there"
 
 
-def _announce(module: NerfDiffModule, last: Path | None, device: torch.device) -> None:
+def _announce(module: NerfDiffModule, last: Path | None, trainer: Trainer, batch_size: int) -> None:
     counts = module.model.parameter_count()
     state = WEIGHTS_ADAM_EMA * counts["total"] / 2**30
     log.info(
@@ -259,4 +261,13 @@ def _announce(module: NerfDiffModule, last: Path | None, device: torch.device) -
         *(counts[part] / 1e6 for part in ("total", "encoder", "denoiser")),
         state,
     )
-    log.info("%s on %s", f"resuming from {last}" if last else "starting afresh", device)
+    if trainer.world_size > 1:
+        where = f"{trainer.world_size} processes on {trainer.num_nodes} nodes"
+    else:
+        where = str(trainer.strategy.root_device)
+        if counts["total"] > PAPERS:
+            log.info(
+                "set for one device, with %d images a step on it; the paper's 8 GPUs: experiment=paper_8gpu model=%s",
+                *(batch_size, module.model.name),
+            )
+    log.info("%s on %s", f"resuming from {last}" if last else "starting afresh", where)

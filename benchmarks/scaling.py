@@ -15,9 +15,11 @@ from nerfdiff.cli import load_config
 from nerfdiff.model import build_on_meta, settings_of
 from nerfdiff.training.memory import WEIGHTS_ADAM_EMA, training_memory
 
-GPUS = {"A100 80 GB": (312e12, 1.8, 235e9), "H100 80 GB": (989e12, 2.5, 370e9)}
-"""Dense bf16 operations per second, price of an hour in dollars (a common rate of 2025), and what NCCL's all-reduce
-moves per second between the 8 GPUs of a node (bus bandwidth over NVLink)."""
+GPUS = {"A100 80 GB": (312e12, 2.0e12, 1.8, 235e9), "H100 80 GB": (989e12, 3.35e12, 2.5, 370e9)}
+"""Dense bf16 operations per second, bytes per second of its memory, dollars an hour (a common rate of 2025), and what
+NCCL's all-reduce moves per second between the 8 GPUs of a node (bus bandwidth over NVLink)."""
+UPDATE = 36
+"""Bytes per parameter that AdamW and the average read and write."""
 NETWORKS = {"8 x 200 Gb/s": 160e9, "1 x 100 Gb/s": 11e9}
 """Bytes per second of an all-reduce between nodes, whose 8 GPUs share them."""
 
@@ -52,8 +54,8 @@ def main() -> None:
         if arguments.memory:
             step = training_memory(config, arguments.batch, 1, arguments.size, arguments.size, "bf16-mixed").step
             print(f"  a step without recomputing: {step / 2**30:.1f} GiB beside")
-        for gpu, (rate, price, within) in GPUS.items():
-            compute = flops / rate / arguments.rate
+        for gpu, (rate, memory, price, within) in GPUS.items():
+            compute = flops / rate / arguments.rate + UPDATE * state / WEIGHTS_ADAM_EMA / memory
             for devices in (1, 8, 16, 64):
                 for network, between in NETWORKS.items() if devices > 8 else [("", within)]:
                     sent = all_reduce(gradients, devices, within, between)

@@ -85,7 +85,7 @@ class StreamedReader:
 
     def _item(self, kind: str, index: int) -> bytes:
         try:
-            return self._items(kind)[index]
+            return bytes(self._items(kind)[index])  # a view of the mapped file
         except Exception as error:  # of files, of the network, of whatever LitData trips over
             words = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise DataError(f"{self.root}/{self.split}/{kind}: item {index} cannot be read ({words})") from error

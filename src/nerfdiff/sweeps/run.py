@@ -1,6 +1,7 @@
 """One sweep from its first batch of jobs to its last, on whatever launcher."""
 
 import logging
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ from nerfdiff.utils.hashes import sha256_values
 
 log = logging.getLogger(__name__)
 
+NUMBER = re.compile(r"=[\d.,e+/-]+$")  # of an override; a shard's, too
 DEATHS = 5
 """Jobs that, each by itself, take their process along, while none ever came back, until the launcher is to blame."""
 
@@ -130,8 +132,11 @@ class Run:
         return [*job, f"hydra.sweep.subdir={get_valid_filename(name)}"]
 
     def _validate(self, batch: Sequence[Job]) -> None:
-        """Raises what Hydra raises of a job that cannot be composed, before the batch begins; one seed tells of all."""
-        for job in {job[: len(job) - bool(self.space.seeds)]: job for job in batch}.values():
+        """Raises what Hydra raises of a job that cannot be composed, before the batch begins.
+
+        Of jobs that differ in numbers alone, as in the seed, one tells of all: an array has thousands of them.
+        """
+        for job in {tuple(NUMBER.sub("=", word) for word in job): job for job in batch}.values():
             self.load(self.config, self._words(job))
 
     def _launch(self, batch: Sequence[Job], again: bool = False) -> list[JobReturn]:

@@ -305,7 +305,7 @@ def check_finite(path: Path) -> None:
 
 
 def check_same_data(path: Path, now: Mapping[str, str]) -> None:
-    """Refuse to go on with other data than a run began with; files that were only moved are the same.
+    """Refuse to go on with other data than a run began with; files that were only moved, or are streamed, are the same.
 
     Args:
         now: what `SceneDataModule.state_dict` says of the data.
@@ -320,8 +320,9 @@ def check_same_data(path: Path, now: Mapping[str, str]) -> None:
     if before == now:
         return
     moved = before["reader"].replace(before["root"], now["root"])
-    if before["files"] == now["files"] and moved == now["reader"]:
-        log.info("the data moved from %s to %s", before["root"], now["root"])
+    if before["files"] == now["files"] and now["reader"] in (moved, before["reader"]):
+        if now["reader"] == moved:
+            log.info("the data moved from %s to %s", before["root"], now["root"])
         return
     if before["root"] != now["root"]:
         what = f"data.root={before['root']}, and data.root is {now['root']} now"

@@ -90,6 +90,11 @@ def scontrol(folder: Path, verb: str, *arguments: str) -> None:
         print(f"JobId={arguments[1]} PreemptTime=None")
 
 
+def send(folder: Path, job: str, signum: int) -> None:
+    """Send a running job's steps a signal, as `--signal` does."""
+    (folder / "jobs" / f"{job}.signal").write_text(str(signum))
+
+
 def scancel(folder: Path, number: str) -> None:
     for name, job in jobs(folder).items():
         if name.split("_")[0] == number and job["state"] not in FINAL:
@@ -123,6 +128,11 @@ def control(folder: Path, parallel: int) -> None:
             elif job["state"] == "PENDING" and len(running) < parallel:
                 change(folder, name, state="RUNNING", tries=job["tries"] + 1)
                 running[start(folder, name, fate(policy, name, job))] = name
+        for asked in (folder / "jobs").glob("*.signal"):  # to the job's steps: what the script's shell runs
+            for pid in (pid for pid, of in running.items() if of == asked.stem):
+                for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+                    os.kill(int(child), int(asked.read_text()))
+            asked.unlink()
         time.sleep(0.02)
 
 

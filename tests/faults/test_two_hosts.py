@@ -1,6 +1,7 @@
 """Training on two hosts, network namespaces of this machine, two ranks each over gloo: `make faults`, as root."""
 
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -13,6 +14,7 @@ import psutil
 import pytest
 import torch
 
+from fake_slurm import FINAL, jobs, send, slurm
 from nerfdiff.checkpoint import steps_of
 from training_fixtures import (
     SRC,
@@ -101,6 +103,15 @@ def wait_for_step(run: Path, step: int, launched: Launched) -> None:
         time.sleep(0.2)
 
 
+def distance(one: dict, other: dict) -> float:
+    """Of two models' weights, as a share of their norm."""
+    difference, norm = (
+        torch.cat([value.flatten() for value in values]).norm()
+        for values in ([one[name] - value for name, value in other.items()], one.values())
+    )
+    return float(difference / norm)
+
+
 def sent() -> int:
     """Bytes that left the first host."""
     path = "/sys/class/net/cable0/statistics/tx_bytes"
@@ -121,11 +132,11 @@ def test_two_hosts_train_what_one_process_does_and_go_on_after_a_death_and_a_cut
             launched.kill()
         one, other = last_checkpoint(alone), last_checkpoint(whole)
         gradients = sum(value.nbytes for value in one["state_dict"].values())
-        apart = max((one["state_dict"][n] - v).abs().max().item() for n, v in other["state_dict"].items())
+        apart = distance(one["state_dict"], other["state_dict"])
         with capsys.disabled():
             print(
-                f"\n40 steps of 4 ranks on 2 hosts and of one process: weights differ by {apart:.2e}; the first "
-                f"host sent {(sent() - before) / 1e6:.1f} MB, gradients are {gradients / 1e6:.2f} MB"
+                f"\n40 steps of 4 ranks and of one process: weights differ by {apart:.1e} of their norm; the "
+                f"first host sent {(sent() - before) / 1e6:.1f} MB, gradients are {gradients / 1e6:.2f} MB"
             )
         assert one["global_step"] == other["global_step"] == 40 and apart < 1e-3
 
@@ -156,6 +167,33 @@ def test_two_hosts_train_what_one_process_does_and_go_on_after_a_death_and_a_cut
     assert_same_state(last_checkpoint(whole), last_checkpoint(broken))
 
 
+def test_under_slurm_a_run_that_gives_way_is_queued_again_and_ends_bit_for_bit(tmp_path, monkeypatch):
+    """By scripts/train.sbatch, on a Slurm of one machine; SIGUSR1 as when the time is up."""
+    data = write_dataset(tmp_path / "data")
+    same = "trainer=ddp", "trainer.accelerator=cpu", "trainer.precision=32-true", "trainer.devices=1"
+    run_training(data, tmp_path / "whole", *STEPS, *same)
+    run, cluster = tmp_path / "run", tmp_path / "slurm"
+    script = SRC.parent / "scripts" / "train.sbatch"
+    words = overrides(data, run, *STEPS, *same)
+    (tmp_path / "job").write_text(f"#!/bin/bash\nset -- {shlex.join(words)}\n{script.read_text()}")
+    monkeypatch.setenv("PYTHON", sys.executable)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    monkeypatch.chdir(SRC.parent)
+    with slurm(cluster, {}, []) as environ:
+        subprocess.run([str(cluster / "bin" / "sbatch"), str(tmp_path / "job")], env=environ, check=True)
+        until, sent = time.monotonic() + 1500, False
+        while (job := jobs(cluster)["100"])["state"] not in FINAL:
+            if not sent and (steps_of(run / "checkpoints" / "last.ckpt") or 0) >= 10:
+                send(cluster, "100", signal.SIGUSR1)
+                sent = True
+            assert time.monotonic() < until
+            time.sleep(0.2)
+        said = (cluster / "jobs" / "100.log").read_text()
+    assert (job["state"], job["tries"]) == ("COMPLETED", 2), said[-4000:]
+    assert (cluster / "scontrol.log").read_text() == "requeue 100\n" and "stopped by SIGUSR1. Step " in said
+    assert_same_state(last_checkpoint(tmp_path / "whole"), last_checkpoint(run))
+
+
 def test_a_run_goes_on_with_another_number_of_ranks_to_the_same_draws(tmp_path, capsys):
     """Six steps of one process, the rest of two: what one process of the same batch makes, but for rounding."""
     data = write_dataset(tmp_path / "data")
@@ -173,13 +211,8 @@ def test_a_run_goes_on_with_another_number_of_ranks_to_the_same_draws(tmp_path, 
     done = subprocess.run(command, capture_output=True, text=True, env=environment() | {"PYTHONPATH": str(SRC)})
     assert done.returncode == 0, done.stderr[-4000:]
     one, other = (last_checkpoint(tmp_path / name)["state_dict"] for name in ("whole", "other"))
-    apart = max((one[name] - value).abs().max().item() for name, value in other.items())
-    moved = max(
-        (one[n] - v).abs().max().item()
-        for n, v in torch.load(tmp_path / "whole" / "checkpoints" / "previous.ckpt", weights_only=True)[
-            "state_dict"
-        ].items()
-    )
+    before = torch.load(tmp_path / "whole" / "checkpoints" / "previous.ckpt", weights_only=True)["state_dict"]
+    apart, moved = distance(one, other), distance(one, before)
     with capsys.disabled():
         print(f"\nsix steps of one process, six of two: weights differ by {apart:.2e}; three steps move {moved:.2e}")
     assert apart < 0.05 * moved

@@ -8,6 +8,7 @@ telling it, `timeout` is ended by Slurm, `preempted` gets the signals and is to 
 left in peace.
 """
 
+import gc
 import json
 import os
 import re
@@ -17,6 +18,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -29,10 +31,11 @@ SLOW = "FAKE_SLURM_SLOW"
 
 
 @contextmanager
-def slurm(folder: Path, policy: dict[str, list[int]], imports: list[str], parallel: int = 4):
+def slurm(folder: Path, policy: dict[str, list[int]], imports: Sequence[str] = (), parallel: int = 4):
     """The environment in which commands find it."""
     (folder / "bin").mkdir(parents=True)
-    (folder / "jobs").mkdir()
+    for name in ("jobs", "asked"):
+        (folder / name).mkdir()
     (folder / "policy.json").write_text(json.dumps(policy))
     for name in COMMANDS:
         command = folder / "bin" / name
@@ -54,22 +57,30 @@ def jobs(folder: Path) -> dict[str, dict]:
     return {path.stem: json.loads(path.read_text()) for path in sorted((folder / "jobs").glob("*.json"))}
 
 
-def change(folder: Path, job: str, **values) -> None:
+def change(folder: Path, job: str, **values) -> dict:
     path = folder / "jobs" / f"{job}.json"
-    content = json.loads(path.read_text()) if path.exists() else {}
+    content = (json.loads(path.read_text()) if path.exists() else {}) | values
     temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    temporary.write_text(json.dumps(content | values))
+    temporary.write_text(json.dumps(content))
     temporary.replace(path)
+    return content
+
+
+def ask(folder: Path, what: str, job: str, number: int = 0) -> None:
+    """Leave a note for `control`."""
+    note = folder / "asked" / f"{time.monotonic_ns()}.tmp"
+    note.write_text(json.dumps([what, job, number]))
+    note.rename(note.with_suffix(".json"))
 
 
 def sbatch(folder: Path, script: str) -> None:
     text = Path(script).read_text()
     number = str(100 + len(list((folder / "jobs").glob("*.sh"))))
-    (folder / "jobs" / f"{number}.sh").write_text(text)
     found = re.search(r"^#SBATCH --array=(\d+)-(\d+)", text, re.M)
     tasks = range(int(found[1]), int(found[2]) + 1) if found else [None]
     for task in tasks:
         change(folder, number if task is None else f"{number}_{task}", state="PENDING", tries=0)
+    (folder / "jobs" / f"{number}.sh").write_text(text)  # last: the jobs begin
     print(f"Submitted batch job {number}")
 
 
@@ -85,20 +96,18 @@ def scontrol(folder: Path, verb: str, *arguments: str) -> None:
     with open(folder / "scontrol.log", "a") as log:
         log.write(f"{verb} {' '.join(arguments)}\n")
     if verb == "requeue":
-        change(folder, arguments[0], requeue=True)
+        ask(folder, "requeue", arguments[0])
     elif arguments[:1] == ("job",):
         print(f"JobId={arguments[1]} PreemptTime=None")
 
 
 def send(folder: Path, job: str, signum: int) -> None:
     """Send a running job's steps a signal, as `--signal` does."""
-    (folder / "jobs" / f"{job}.signal").write_text(str(signum))
+    ask(folder, "signal", job, signum)
 
 
 def scancel(folder: Path, number: str) -> None:
-    for name, job in jobs(folder).items():
-        if name.split("_")[0] == number and job["state"] not in FINAL:
-            change(folder, name, cancelled=True)
+    ask(folder, "cancel", number)
 
 
 def srun(folder: Path, *arguments: str) -> None:
@@ -113,45 +122,54 @@ def srun(folder: Path, *arguments: str) -> None:
 def control(folder: Path, parallel: int) -> None:
     """Start what waits, and write down what became of it."""
     running: dict[int, str] = {}
+    waiting: list[str] = []
+    tries: dict[str, int] = {}
+    requeued, seen = set(), set()
     signal.signal(signal.SIGTERM, lambda *_: ([os.kill(pid, signal.SIGKILL) for pid in running], os._exit(0)))
     policy = json.loads((folder / "policy.json").read_text())
+    gc.freeze()
     while True:
+        for script in sorted(set((folder / "jobs").glob("*.sh")) - seen):
+            seen.add(script)
+            found = [p.stem for p in (folder / "jobs").glob(f"{script.stem}*.json")]
+            waiting += sorted(found, key=lambda name: int(name.partition("_")[2] or 0))
+        for note in sorted((folder / "asked").glob("*.json")):
+            what, name, number = json.loads(note.read_text())
+            note.unlink()
+            mine = [pid for pid, of in running.items() if name in (of, of.partition("_")[0])]
+            if what == "requeue":
+                requeued.add(name)
+            elif what == "signal":  # to the job's steps: what the script's shell runs
+                below = [Path(f"/proc/{pid}/task/{pid}/children").read_text().split() for pid in mine]
+                [os.kill(int(child), number) for children in below for child in children]
+            else:
+                [os.kill(pid, signal.SIGKILL) for pid in mine]
+                gone = [of for of in waiting if name in (of, of.partition("_")[0])]
+                waiting = [of for of in waiting if of not in gone]
+                [change(folder, of, state="CANCELLED") for of in gone]
         for pid in list(running):
             done, status = os.waitpid(pid, os.WNOHANG)
             if done:
-                finish(folder, running.pop(pid), os.waitstatus_to_exitcode(status))
-        for name, job in jobs(folder).items():
-            if job.get("cancelled") and job["state"] not in FINAL:
-                [os.kill(pid, signal.SIGKILL) for pid, of in running.items() if of == name]
-                if name not in running.values():
-                    change(folder, name, state="CANCELLED")
-            elif job["state"] == "PENDING" and len(running) < parallel:
-                change(folder, name, state="RUNNING", tries=job["tries"] + 1)
-                running[start(folder, name, fate(policy, name, job))] = name
-        for asked in (folder / "jobs").glob("*.signal"):  # to the job's steps: what the script's shell runs
-            for pid in (pid for pid, of in running.items() if of == asked.stem):
-                for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
-                    os.kill(int(child), int(asked.read_text()))
-            asked.unlink()
+                name, code = running.pop(pid), os.waitstatus_to_exitcode(status)
+                state = "COMPLETED" if code == 0 else "TIMEOUT" if code == -signal.SIGXCPU else "FAILED"
+                if name in requeued:
+                    requeued.remove(name)
+                    waiting.append(name)
+                    state = "PENDING"
+                change(folder, name, state=state, code=code)
+        while waiting and len(running) < parallel:
+            name = waiting.pop(0)
+            tries[name] = tries.get(name, 0) + 1
+            change(folder, name, state="RUNNING", tries=tries[name])
+            running[start(folder, name, fate(policy, name, tries[name]))] = name
         time.sleep(0.02)
 
 
-def fate(policy: dict[str, list[int]], name: str, job: dict) -> str | None:
+def fate(policy: dict[str, list[int]], name: str, tries: int) -> str | None:
     number, _, task = name.partition("_")
-    if number != "100" or job["tries"]:
+    if number != "100" or tries > 1:
         return None
     return next((kind for kind, tasks in policy.items() if int(task or 0) in tasks), None)
-
-
-def finish(folder: Path, name: str, code: int) -> None:
-    job = jobs(folder)[name]
-    if job.get("cancelled"):
-        state = "CANCELLED"
-    elif job.get("requeue"):
-        state = "PENDING"
-    else:
-        state = "COMPLETED" if code == 0 else "TIMEOUT" if code == -signal.SIGXCPU else "FAILED"
-    change(folder, name, state=state, requeue=False, code=code)
 
 
 def start(folder: Path, name: str, what: str | None) -> int:

@@ -179,7 +179,7 @@ def test_under_slurm_a_run_that_gives_way_is_queued_again_and_ends_bit_for_bit(t
     monkeypatch.setenv("PYTHON", sys.executable)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     monkeypatch.chdir(SRC.parent)
-    with slurm(cluster, {}, []) as environ:
+    with slurm(cluster, {}) as environ:
         subprocess.run([str(cluster / "bin" / "sbatch"), str(tmp_path / "job")], env=environ, check=True)
         until, sent = time.monotonic() + 1500, False
         while (job := jobs(cluster)["100"])["state"] not in FINAL:

@@ -125,6 +125,12 @@ hydra:
 """
 
 
+PRELOADED = (
+    *("numpy", "submitit.core._submit", "hydra", "hydra_plugins.hydra_submitit_launcher.submitit_launcher"),
+    *("hydra_plugins.nerfdiff_sweeper", "nerfdiff.sweeps.task", "nerfdiff.results.row", "nerfdiff.stopping"),
+)
+
+
 def array(folder, count, policy, parallel=4):
     """The rows of a sweep of so many jobs on a Slurm that deals with them by `policy`; its commands' words."""
     sweep, cluster = folder / "sweep", folder / "slurm"
@@ -132,7 +138,7 @@ def array(folder, count, policy, parallel=4):
     (folder / "light.yaml").write_text(LIGHT_CONFIG.replace("CONF", str(CONF)))
     sweep.mkdir()
     command = [sys.executable, str(folder / "light.py"), f"x=range({count})", f"hydra.sweep.dir={sweep}"]
-    with slurm(cluster, policy, ["submitit.core._submit", "hydra", "nerfdiff.stopping"], parallel) as environ:
+    with slurm(cluster, policy, PRELOADED, parallel) as environ:
         done = subprocess.run(command, capture_output=True, text=True, env=environ, cwd=folder, timeout=3000)
     words = done.stdout + done.stderr + (cluster / "control.log").read_text()
     assert done.returncode == 0, words[-4000:]

@@ -54,12 +54,20 @@ def test_the_elevation_says_where_up_is(scene):
     assert render_rgba(scene.saved, camera, 16).shape == (1, 4, 16, 16)
 
 
-def test_pictures_are_framed_as_the_models_were(model):
-    chairs = replace(model.loaded, trained_on=[{"dataset": "srn_chairs"}])
+def test_pictures_are_framed_as_the_models_were(model, tmp_path, caplog):
+    chairs = replace(model.loaded, path=ASSETS / "demo_chairs" / "model.safetensors")
     cfg = load_config("picture", ["picture.object_share=0.5"])
     framed = [_of_picture(cfg, WAGON, loaded).picture for loaded in (model.loaded, chairs)]
-    assert [(one.near, one.far, one.object_share) for one in framed] == [(0.8, 1.8, 0.5), (1.25, 2.75, 0.5)]
-    assert _of_picture(load_config("picture", []), WAGON, chairs).picture.object_share == 0.43
+    assert [one.object_share for one in framed] == [0.5, 0.5]
+    assert [(one.near, one.far) for one in framed] == [pytest.approx(ends) for ends in ((0.8, 1.8), (1.25, 2.75))]
+    assert [one.fov for one in framed] == pytest.approx([52, 52], abs=0.1)
+    shares = [
+        _of_picture(load_config("picture", []), WAGON, loaded).picture.object_share for loaded in (model.loaded, chairs)
+    ]
+    assert 0.6 < shares[0] < 0.7 and 0.35 < shares[1] < 0.5
+    unknown = replace(model.loaded, path=tmp_path / "model.safetensors")
+    assert _of_picture(load_config("picture", []), WAGON, unknown).picture.object_centre == [0.5, 0.545]
+    assert "does not say how its training images were framed" in caplog.text
 
 
 def test_what_cannot_be_is_named(model, scene, tmp_path):

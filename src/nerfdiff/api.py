@@ -28,7 +28,7 @@ from nerfdiff.data.cutout import Mask
 from nerfdiff.distill.priors import all_cameras
 from nerfdiff.evaluation.distill import build_strategy
 from nerfdiff.evaluation.progress import SceneProgress
-from nerfdiff.evaluation.run import autocast, choose_device, picture_scene
+from nerfdiff.evaluation.run import autocast, choose_device, framed_as_trained, picture_scene
 from nerfdiff.exported_model import LoadedModel
 from nerfdiff.exports.export import FORMATS, FieldExport
 from nerfdiff.exports.views import render_rgba, to_image
@@ -165,19 +165,7 @@ def _of_picture(cfg: DictConfig, picture: str | Path, loaded: LoadedModel) -> Di
             picture,
             cfg.picture_views.source_elevation,
         )
-    dataset = loaded.trained_on[-1]["dataset"] if loaded.trained_on else None
-    if dataset not in cfg.framings:
-        log.warning(
-            "%s was trained on %s, whose framing is not known: the picture is framed as SRN's cars (picture.near, "
-            "picture.far, picture.object_share and picture.fov say otherwise)",
-            loaded.path,
-            dataset or "unknown data",
-        )
-        return cfg
-    for key, value in cfg.framings[dataset].items():
-        if cfg.picture[key] == cfg.framings.srn_cars[key]:
-            cfg.picture[key] = value
-    return cfg
+    return framed_as_trained(cfg, loaded)
 
 
 @dataclass(frozen=True)

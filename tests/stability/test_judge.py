@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 from model_fixtures import input_cameras, look_at, model
 from nerfdiff.data.batch import ViewBatch
@@ -12,12 +13,14 @@ from nerfdiff.distill.strategy import PredictedViews
 from nerfdiff.distill.trace import Step
 from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.fit.saved_field import SavedField
+from nerfdiff.stability.facts import facts
 from nerfdiff.stability.familiar import Familiar, features
 from nerfdiff.stability.judge import ENDS, LEAST, MOST, SIGNS, Judge
 from nerfdiff.stability.limits import Sample, fit_limits, halves, limits_text, rates, suspected
 from nerfdiff.utils.errors import ConfigError, DataError
 
 SIZE = 16
+OLD = {"familiar": '{"rest": 1.0, "usual": 1.0}'}
 JUDGE = Judge(views=3, time=0.6, least={"input_psnr": 20.0, "least_coverage": 0.3}, most={"border": 0.2, "unlike": 1.5})
 
 
@@ -108,24 +111,29 @@ def test_a_fallback_a_wrong_input_view_and_a_sign_that_is_not_finite_are_suspect
         Judge(1, 0.5, {"beauty": 1.0}, {})
 
 
-def test_an_image_unlike_the_training_images_is_far_from_them(net, scene, tmp_path):
+def test_an_image_unlike_the_training_images_is_far_from_them(net, scene, tmp_path, caplog):
+    path = tmp_path / "familiar.safetensors"
     draws = torch.Generator().manual_seed(0)
-    encoded = []
+    encoded, known = [], []
     for _ in range(48):
         pixels = scene.source_pixels.clone()
         pixels[..., 4:12, 4:12] = torch.randint(40, 160, (3, 8, 8), generator=draws).byte()
         encoded.append(features(net.encode(replace(scene, source_pixels=pixels))))
-    familiar = Familiar.of(torch.cat(encoded), kept=8)
+        known.append(facts(replace(scene, source_pixels=pixels)))
+    familiar = Familiar.of(torch.cat(encoded), 8, torch.cat(known))
     assert float(familiar.distance(torch.cat(encoded[1::2])).max()) < 1.3
-    familiar.save(tmp_path / "familiar.safetensors")
-    loaded = Familiar.load(tmp_path / "familiar.safetensors")
+    familiar.save(path)
+    loaded = Familiar.load(path)
     black = replace(scene, source_pixels=torch.zeros_like(scene.source_pixels))
     for known in (familiar, loaded):
         assert float(known.distance(features(net.encode(scene)))[0]) < 1.3
-        assert signs(net, black, PredictedViews(black.source.expand(3, -1, -1, -1)), known)["unlike"] > 2
-    (tmp_path / "familiar.safetensors").write_bytes(b"no")
+        found = signs(net, black, PredictedViews(black.source.expand(3, -1, -1, -1)), known)
+        assert found["unlike"] > 2 and found["size"] > 0.2 and found["near"] == 0
+    save_file({name: part for name, part in load_file(path).items() if name != "ranges"}, path, OLD)
+    assert Familiar.load(path).ranges is None and "make it again" in caplog.text
+    path.write_bytes(b"no")
     with pytest.raises(DataError, match=r"familiar\.safetensors: cannot be read"):
-        Familiar.load(tmp_path / "familiar.safetensors")
+        Familiar.load(path)
 
 
 def samples(count: int, seed: int) -> list[Sample]:

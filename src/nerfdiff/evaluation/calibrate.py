@@ -11,7 +11,7 @@ from nerfdiff.checkpoint import load_model
 from nerfdiff.data.batch import Sample, ViewBatch
 from nerfdiff.evaluation.controls import controls, controls_markdown
 from nerfdiff.results.frame import find_results, read_runs
-from nerfdiff.stability.familiar import FAMILIAR, Familiar, features_of
+from nerfdiff.stability.familiar import FAMILIAR, Familiar, measured
 from nerfdiff.stability.limits import fit_limits, halves, limits_text, samples_of
 from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.files import write_text
@@ -55,7 +55,8 @@ def _familiar(cfg: DictConfig) -> None:
             view = int(torch.randint(len(reader.view_names(index)), (), generator=draws))
             yield ViewBatch.collate([Sample(reader.load(index, [view]), source=0, targets=[0], draw=number)])
 
-    familiar = Familiar.of(features_of(loaded.model, batches()), cfg.kept)
+    found, known = measured(loaded.model, batches())
+    familiar = Familiar.of(found, cfg.kept, known)
     path = Path(cfg.out) if cfg.out is not None else loaded.path.parent / FAMILIAR
     familiar.save(path)
     log.info("what %d training images look like: %s", cfg.images, path)

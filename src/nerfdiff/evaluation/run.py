@@ -1,5 +1,6 @@
 """An evaluation run: a model, scenes, settings, and all that predictions of one run share."""
 
+import copy
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -22,7 +23,7 @@ from nerfdiff.distill.strategy import Strategy
 from nerfdiff.exported_model import LoadedModel
 from nerfdiff.model import NerfDiff
 from nerfdiff.results.environment import hardware
-from nerfdiff.stability.familiar import FAMILIAR, Familiar
+from nerfdiff.stability.familiar import Familiar
 from nerfdiff.stability.judge import Judge
 from nerfdiff.stress.stress import Stress, row_fields, stress_of
 from nerfdiff.utils.config import auto_precision, plain
@@ -35,6 +36,7 @@ log = logging.getLogger(__name__)
 
 PRECISIONS = {"32-true": None, "bf16-mixed": torch.bfloat16, "16-mixed": torch.float16}
 SAMPLES = ("uniform_samples", "importance_samples")
+AUTO = "auto"
 
 
 @dataclass(frozen=True)
@@ -245,6 +247,7 @@ def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
         raise ConfigError(f"shard={cfg.shard} is of a dataset's scenes, and image={cfg.image} is one picture")
     if (stress := stress_of(cfg)) is not None and stress.input_view is not None:
         raise ConfigError(f"stress={stress.axis} chooses another input view, and a picture has none")
+    cfg = framed_as_trained(cfg, loaded)
     scene = picture_scene(cfg, size)
     facts = {
         "split_sha256": sha256_values(list(scene.scene_ids)),
@@ -255,6 +258,30 @@ def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
     }
     ids = list(scene.scene_ids)
     return _run(cfg, device, loaded, lambda names: [scene] * len(names), ids, ids, facts, None, stress)
+
+
+def framed_as_trained(cfg: DictConfig, loaded: LoadedModel) -> DictConfig:
+    """Return a config whose picture is framed as the model's training images were, in all that it leaves at `auto`.
+
+    What the model does not say, `cfg.framing` does, and a log line names it.
+    """
+    asked = [key for key, value in cfg.picture.items() if value == AUTO]
+    if not asked:
+        return cfg
+    familiar = Familiar.beside(loaded.path)
+    known = familiar.framing() if familiar is not None else None
+    if known is None:
+        known = cfg.framing
+        log.warning(
+            "%s does not say how its training images were framed (docs/stability.md: part=familiar): picture.%s as "
+            "framing has them, which are of SRN's cars",
+            loaded.path,
+            ", picture.".join(asked),
+        )
+    cfg = copy.deepcopy(cfg)
+    for key in asked:
+        cfg.picture[key] = known[key]
+    return cfg
 
 
 def picture_scene(cfg: DictConfig, size: Sequence[int], where: np.ndarray | None = None) -> ViewBatch:
@@ -315,7 +342,6 @@ def _run(
     compile_unets(model, cfg.compile, cfg.paths.compiled_dir)
     spent_on = [hardware(device), cfg.threads, cfg.scenes_at_once, model.renderer.chunk, in_pixels]
     settings = RunSettings.of(cfg)
-    familiar = loaded.path.parent / FAMILIAR
     return EvaluationRun(
         settings=settings,
         model=model,
@@ -331,6 +357,6 @@ def _run(
         rows_before=settings.results.stat().st_size if settings.results.is_file() else 0,
         data=data,
         judge=instantiate(cfg.judge),
-        familiar=Familiar.load(familiar) if familiar.is_file() else None,
+        familiar=Familiar.beside(loaded.path),
         stress=stress,
     )

@@ -1,9 +1,12 @@
-"""The distance of an input image from those that a model was trained on, by the encoder's own features."""
+"""What the inputs that a model was trained on look like: by the encoder's own features, and by plain facts."""
 
 import json
+import logging
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -11,9 +14,13 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from nerfdiff.data.batch import ViewBatch
 from nerfdiff.field.encoder import Encoding
+from nerfdiff.stability.facts import FACTS, excess, facts, names_of, usual_range
 from nerfdiff.utils.errors import DataError
 from nerfdiff.utils.files import atomic
+
+log = logging.getLogger(__name__)
 
 FAMILIAR = "familiar.safetensors"
 """The file beside a model's weights."""
@@ -28,7 +35,7 @@ def features(encoding: Encoding) -> Float[Tensor, "batch dim"] | None:
 
 @dataclass(frozen=True)
 class Familiar:
-    """The features of training images: their principal axes, and what is left beside them.
+    """The features of training images: their principal axes, and what is left beside them; and their facts' ranges.
 
     Args:
         mean: of the features.
@@ -36,6 +43,7 @@ class Familiar:
         spread: standard deviation along each axis.
         rest: root mean square of what the axes leave, over dimensions and images.
         usual: distance that 99 % of images held out from the axes do not exceed.
+        ranges: lower end, median and upper end of the training inputs' facts; None in files from before there were any.
     """
 
     mean: Float[Tensor, "dim"]
@@ -43,10 +51,17 @@ class Familiar:
     spread: Float[Tensor, "kept"]
     rest: float
     usual: float
+    ranges: Float[Tensor, "facts 3"] | None = None
 
     @staticmethod
-    def of(found: Float[Tensor, "images dim"], kept: int) -> "Familiar":
-        """Take axes from every other image, and the usual distance from the others."""
+    def of(found: Float[Tensor, "images dim"], kept: int, known: Float[Tensor, "images facts"]) -> "Familiar":
+        """Take axes from every other image, the usual distance from the others, and ranges from all.
+
+        Args:
+            found: the images' features.
+            kept: axes at most.
+            known: the images' facts.
+        """
         fitted, held_out = found[::2].double(), found[1::2]
         mean = fitted.mean(0)
         _, sizes, rows = torch.linalg.svd(fitted - mean, full_matrices=False)
@@ -56,7 +71,7 @@ class Familiar:
         parts = (mean.float(), axes.float().contiguous(), spread.float())
         unscaled = Familiar(*parts, rest=float(left.square().mean().sqrt()), usual=1.0)
         usual = float(torch.quantile(unscaled.distance(held_out), QUANTILE))
-        return Familiar(*parts, rest=unscaled.rest, usual=usual)
+        return Familiar(*parts, rest=unscaled.rest, usual=usual, ranges=usual_range(known))
 
     def distance(self, found: Float[Tensor, "images dim"]) -> Float[Tensor, "images"]:
         """Return distances, 1 being as far as the 99th of 100 training images: along the axes and beside them."""
@@ -66,6 +81,23 @@ class Familiar:
         beside = (centred - along @ axes.T).square().mean(1) / self.rest**2
         return ((along / spread).square().mean(1) + beside).sqrt() / self.usual
 
+    def beyond(self, scene: ViewBatch) -> dict[str, float]:
+        """Return how far each fact of one scene's input lies beyond the training inputs' range, in its widths."""
+        return {} if self.ranges is None else names_of(excess(facts(scene)[0], self.ranges))
+
+    def framing(self) -> dict[str, Any] | None:
+        """Return settings of a `Picture` with which it is framed as the training inputs were; None: unknown."""
+        if self.ranges is None:
+            return None
+        middle = {name: round(value, 4) for name, value in zip(FACTS, self.ranges[:, 1].tolist(), strict=True)}
+        return {
+            "fov": round(math.degrees(2 * math.atan(0.5 / middle["focal"])), 2),
+            "near": middle["near"],
+            "far": middle["far"],
+            "object_share": middle["share"],
+            "object_centre": [0.5 + middle["across"] / 2, 0.5 + middle["along"] / 2],
+        }
+
     def save(self, path: Path) -> None:
         """Write a file that `load` reads, in halves.
 
@@ -73,8 +105,21 @@ class Familiar:
             DataError: it cannot be written.
         """
         tensors = {"mean": self.mean, "axes": self.axes.half(), "spread": self.spread}
+        if self.ranges is not None:
+            tensors["ranges"] = self.ranges.contiguous()
+        about = {"rest": self.rest, "usual": self.usual}
         with atomic(path) as temporary:
-            save_file(tensors, temporary, {"familiar": json.dumps({"rest": self.rest, "usual": self.usual})})
+            save_file(tensors, temporary, {"familiar": json.dumps(about), "facts": json.dumps(list(FACTS))})
+
+    @staticmethod
+    def beside(weights: Path) -> "Familiar | None":
+        """Read what lies beside a model's weights, if anything does.
+
+        Raises:
+            DataError: it is damaged.
+        """
+        path = weights.parent / FAMILIAR
+        return Familiar.load(path) if path.is_file() else None
 
     @staticmethod
     def load(path: Path) -> "Familiar":
@@ -86,14 +131,20 @@ class Familiar:
         try:
             with safe_open(path, framework="pt") as file:
                 numbers = json.loads(file.metadata()["familiar"])
-                return Familiar(*(file.get_tensor(name).float() for name in ("mean", "axes", "spread")), **numbers)
+                names = json.loads(file.metadata().get("facts", "[]"))
+                if names != list(FACTS):
+                    log.warning("%s: has no ranges of this version's facts; make it again (docs/stability.md)", path)
+                ranges = file.get_tensor("ranges") if names == list(FACTS) else None
+                parts = (file.get_tensor(name).float() for name in ("mean", "axes", "spread"))
+                return Familiar(*parts, **numbers, ranges=ranges)
         except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
             raise DataError(
                 f"{path}: cannot be read ({error}); delete it, or make it again (docs/stability.md)"
             ) from error
 
 
-def features_of(model, batches: Iterable) -> Float[Tensor, "images dim"]:
-    """Return the features of the inputs of batches."""
+def measured(model, batches: Iterable[ViewBatch]) -> tuple[Float[Tensor, "images dim"], Float[Tensor, "images facts"]]:
+    """Return the features and the facts of the inputs of batches."""
     with torch.no_grad():
-        return torch.cat([features(model.encode(batch)).cpu() for batch in batches])
+        found = [(features(model.encode(batch)).cpu(), facts(batch)) for batch in batches]
+    return torch.cat([each for each, _ in found]), torch.cat([each for _, each in found])

@@ -13,6 +13,7 @@ from nerfdiff.diffusion.schedule import add_noise, alpha_sigma
 from nerfdiff.distill.strategy import PredictedViews
 from nerfdiff.metrics.image import psnr
 from nerfdiff.model import NerfDiff
+from nerfdiff.stability.facts import FACTS
 from nerfdiff.stability.familiar import Familiar, features
 from nerfdiff.stress.photo import object_mask
 from nerfdiff.utils.errors import ConfigError
@@ -33,6 +34,7 @@ SIGNS = {
     "samples": "the diffusion model's samples disagree ({:.1f} dB)",
     "denoised": "the diffusion model sees other views than the field's ({:.1f} dB)",
     "unlike": "the input is unlike the training images ({:.2f} of their usual distance)",
+    **{name: f"{words} ({{:.2f}} beyond their range)" for name, words in FACTS.items()},
 }
 """What each sign says where it is out of its limits."""
 LEAST, MOST = "least", "most"
@@ -40,7 +42,7 @@ ENDS = {
     **dict.fromkeys(
         ("input_psnr", "input_iou", "least_coverage", "agreement", "moved", "samples", "denoised"), (LEAST,)
     ),
-    **dict.fromkeys(("border", "haze", "unlike"), (MOST,)),
+    **dict.fromkeys(("border", "haze", "unlike", *FACTS), (MOST,)),
     **dict.fromkeys(("coverage", "flatness"), (LEAST, MOST)),
 }
 """At which end each sign is bad."""
@@ -81,7 +83,7 @@ class Judge:
         """
         mask = object_mask(scene.source[0])
         encoding = model.encode(scene)
-        found = {}
+        found = {} if familiar is None else familiar.beyond(scene)
         if familiar is not None and (of_input := features(encoding)) is not None:
             found["unlike"] = float(familiar.distance(of_input)[0])
         chosen = spread(len(predicted.images), self.views)

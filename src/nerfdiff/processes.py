@@ -8,9 +8,8 @@ import time
 from subprocess import Popen
 
 import torch
+from lightning.fabric.plugins.environments import TorchElasticEnvironment
 from lightning.fabric.strategies.launchers import subprocess_script
-
-from nerfdiff.utils.rank import is_first
 
 GRACE = 10.0
 """Seconds that a process has to notice another's death by itself and to end with words of its own."""
@@ -27,8 +26,8 @@ def watch() -> None:
 
 
 def is_launched() -> bool:
-    """Return true if this process was launched to help another."""
-    return not is_first()
+    """Return true if another process of the run launched this one, which then speaks for it: torchrun does not."""
+    return int(os.environ.get("LOCAL_RANK", 0)) > 0 and not TorchElasticEnvironment.detect()
 
 
 def end_launched(signum: int) -> None:

@@ -1,5 +1,6 @@
 """Processes that meet beside their work, of which one dies, hangs, or ends with the others."""
 
+import os
 import signal
 import sys
 import time
@@ -10,6 +11,7 @@ import torch
 from torch import distributed
 
 from fault_child import start
+from nerfdiff.processes import lost_process
 from nerfdiff.training.callbacks.heartbeat import Heartbeat
 
 PATIENCE = 1.5
@@ -58,6 +60,18 @@ def test_a_process_that_is_gone_ends_the_others_with_a_sentence(fault, tmp_path,
     assert "error: Another process of this run ended, or cannot be reached." in said and "goes on" in said
     lost.kill()
     lost.wait()
+
+
+def test_who_says_that_a_process_is_gone(monkeypatch):
+    """The first of those that it launched; all that torchrun did, as the first may be the one that is gone."""
+    lost, parent = RuntimeError("gloo: connection closed"), os.getppid()
+    monkeypatch.setattr("nerfdiff.processes._PARENT", parent)
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    with pytest.raises(SystemExit):
+        lost_process(lost)
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
+    assert lost_process(lost) == "Another process of this run ended, or cannot be reached."
+    assert lost_process(RuntimeError("something else")) is None
 
 
 def test_processes_that_end_at_different_times_end_well(tmp_path):

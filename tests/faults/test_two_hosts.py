@@ -174,10 +174,16 @@ def test_under_slurm_a_run_that_gives_way_is_queued_again_and_ends_bit_for_bit(t
     """By scripts/train.sbatch, on a Slurm of one machine; SIGUSR1 as when the time is up."""
     data = write_dataset(tmp_path / "data")
     same = "trainer=ddp", "trainer.accelerator=cpu", "trainer.precision=32-true", "trainer.devices=1"
-    run_training(data, tmp_path / "whole", *STEPS, *same)
+    steps = [
+        "trainer.max_steps=12",
+        "callbacks.last.every_n_steps=2",
+        "validation_every=100",
+        "callbacks.previews=null",
+    ]
+    run_training(data, tmp_path / "whole", *steps)
     run, cluster = tmp_path / "run", tmp_path / "slurm"
     script = SRC.parent / "scripts" / "train.sbatch"
-    words = overrides(data, run, *STEPS, *same)
+    words = overrides(data, run, *steps, *same)
     (tmp_path / "job").write_text(f"#!/bin/bash\nset -- {shlex.join(words)}\n{script.read_text()}")
     monkeypatch.setenv("PYTHON", sys.executable)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
@@ -186,7 +192,7 @@ def test_under_slurm_a_run_that_gives_way_is_queued_again_and_ends_bit_for_bit(t
         subprocess.run([str(cluster / "bin" / "sbatch"), str(tmp_path / "job")], env=environ, check=True)
         until, sent = time.monotonic() + 1500, False
         while (job := jobs(cluster)["100"])["state"] not in FINAL:
-            if not sent and (steps_of(run / "checkpoints" / "last.ckpt") or 0) >= 10:
+            if not sent and (steps_of(run / "checkpoints" / "last.ckpt") or 0) >= 2:
                 send(cluster, "100", signal.SIGUSR1)
                 sent = True
             assert time.monotonic() < until

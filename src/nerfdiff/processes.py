@@ -44,6 +44,9 @@ def lost_process(error: RuntimeError) -> str | None:
     network = isinstance(error, torch.distributed.DistError) or "gloo" in str(error).lower()
     if not network:
         return None
+    if "EADDRINUSE" in str(error):
+        port = os.environ.get("MASTER_PORT", "unknown")
+        return f"The port at which the processes of this run meet is in use: set MASTER_PORT to another than {port}."
     time.sleep(0.2)  # it is heard of before the system knows how it ended
     if is_launched() and os.getppid() == _PARENT:
         sys.exit(1)  # the first process will say it

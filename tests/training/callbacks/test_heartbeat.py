@@ -72,6 +72,8 @@ def test_who_says_that_a_process_is_gone(monkeypatch):
     monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
     assert lost_process(lost) == "Another process of this run ended, or cannot be reached."
     assert lost_process(RuntimeError("something else")) is None
+    taken = distributed.DistNetworkError("failed to listen, name: EADDRINUSE")
+    assert "set MASTER_PORT" in lost_process(taken)
 
 
 def test_processes_that_end_at_different_times_end_well(tmp_path):

@@ -70,7 +70,7 @@ def test_units_are_the_pages(tmp_path):
 
 def test_the_page_says_what_its_intervals_are(tmp_path):
     words = content(chart(write_results(tmp_path, result())))["how"]
-    assert "95% bootstrap" in words and "the median ± half the interquartile range" in words
+    assert "95% bootstrap intervals of the difference to none" in words and "fewer than 6 scenes" in words
 
 
 def test_tables_and_pictures_lie_beside_the_page(tmp_path):

@@ -59,7 +59,7 @@ def page(one_page):
     if one_page.is_visible("#details"):
         one_page.click("#details .close")
     one_page.select_option("#device", "Test CPU")
-    for selector, choice in (("#cost", "scene_s"), ("#colour", "strategy")):
+    for selector, choice in (("#cost", "scene_s"), ("#colour", "strategy"), ("#axis", "value")):
         one_page.select_option(selector, choice)
     one_page.click("[data-metric=psnr]")
     one_page.check("#intervals")
@@ -128,26 +128,6 @@ def test_the_frontier_is_the_true_one(page):
     assert page.evaluate(f"{PLOT}._fullLayout.xaxis.type") == "log"
 
 
-def test_intervals_are_drawn_both_ways(page, page_path):
-    trace = f"{PLOT}.data.find((each) => each.meta === 'frontier' && each.customdata.includes({NAMES.index('good')}))"
-    at = page.evaluate(f"{trace}.customdata").index(NAMES.index("good"))
-    ends = "({ array, arrayminus, visible }) => [arrayminus, array, visible]"
-    below, above, shown = page.evaluate(f"({ends})({trace}.error_x)")
-    assert (below[at], above[at], shown) == (
-        pytest.approx(0.4),
-        pytest.approx(0.4),
-        True,
-    )  # half the quartiles' distance
-    below, above, shown = page.evaluate(f"({ends})({trace}.error_y)")
-    with open(page_path.parent / "configurations.csv", newline="") as file:
-        good = list(csv.DictReader(file))[NAMES.index("good")]
-    assert float(good["psnr_low"]) < 21.5 and shown
-    expected = (22 - float(good["psnr_low"]), float(good["psnr_high"]) - 22)
-    assert (below[at], above[at]) == pytest.approx(expected, abs=1e-3)
-    page.uncheck("#intervals")
-    assert page.evaluate(f"{trace}.error_y.visible") is False
-
-
 def test_selectors_change_what_is_shown(page):
     assert drawn(page, "frontier").keys() | drawn(page, "dominated").keys() == set(range(5))
     page.select_option("#cost", "denoiser_calls")
@@ -156,7 +136,7 @@ def test_selectors_change_what_is_shown(page):
     ticks = page.evaluate(f"[{PLOT}._fullLayout.xaxis.tickvals, {PLOT}._fullLayout.xaxis.ticktext]")
     assert dict(zip(*ticks, strict=True))[drawn(page, "frontier")[0][0]] == "0"
     page.select_option("#colour", "inner_steps")
-    assert page.locator("#plot .legendtext").all_text_contents()[:5] == ["1", "2", "4", "8", "16"]
+    assert page.locator("#legend .name").all_inner_texts()[:5] == ["1", "2", "4", "8", "16"]
     assert page.locator("#failed-strip button").count() == 3
     page.select_option("#device", "Fast GPU")
     assert drawn(page, "frontier").keys() | drawn(page, "dominated").keys() == {5, 6}
@@ -194,28 +174,36 @@ def test_an_open_page_follows_its_address(page):
     assert page.input_value("#colour") == "inner_steps"
 
 
-def groups(page) -> dict[str, object]:
-    """Whether each entry of the legend is shown."""
-    entries = page.evaluate(
-        f"{PLOT}._fullData.filter(({{ meta }}) => meta === 'legend').map((t) => [t.name, t.visible])"
+def pressed(page) -> dict[str, bool]:
+    """Whether each button of the legend shows its points."""
+    buttons = page.locator("#legend button").evaluate_all(
+        "found => found.map((each) => [each.dataset.group, each.ariaPressed])"
     )
-    return dict(entries)
+    return {group: state == "true" for group, state in buttons}
+
+
+def all_drawn(page) -> set[int]:
+    return drawn(page, "frontier").keys() | drawn(page, "dominated").keys()
 
 
 def test_what_the_legend_hides_stays_hidden_and_nothing_else_is(page):
-    page.locator("#plot .legendtoggle").nth(1).click()
-    page.wait_for_function(f"{PLOT}._fullData.some((trace) => trace.visible === 'legendonly')")
-    hidden = {"direct": True, "ngd": "legendonly", "none": True, "sds": True}
-    assert groups(page) == hidden
+    page.click("#legend [data-group=ngd]")
+    hidden, others = {"direct": True, "ngd": False, "none": True, "sds": True}, {0, 1, 4}
+    assert pressed(page) == hidden and all_drawn(page) == others
     page.click("[data-metric=st_lpips_vgg]")
-    assert groups(page) == hidden
+    assert pressed(page) == hidden and all_drawn(page) == others
     page.select_option("#colour", "inner_steps")  # numbers, whose legend hides nothing
-    assert set(groups(page).values()) == {True}
-    page.locator("#plot .legendtoggle").nth(1).click(force=True)
-    page.wait_for_timeout(500)  # as long as a double click may take
-    assert set(groups(page).values()) == {True}
-    assert drawn(page, "frontier").keys() | drawn(page, "dominated").keys() == set(range(5))
+    assert pressed(page) == {} and all_drawn(page) == set(range(5))
     page.select_option("#colour", "strategy")
+    page.focus("#legend [data-group=ngd]")
+    page.keyboard.press("Enter")
+    assert all(pressed(page).values()) and all_drawn(page) == set(range(5))
+    page.click("#legend [data-group=sds]", modifiers=["Shift"])
+    assert all_drawn(page) == {4}
+    page.click("#legend [data-group=sds]")
+    for name in hidden:
+        page.click(f"#legend [data-group={name}]")
+    assert all(pressed(page).values())
 
 
 def test_what_memory_is_on_a_cpu_is_told(open_page, tmp_path):
@@ -237,7 +225,10 @@ def test_what_has_no_cost_is_in_the_table_alone(page):
 
 
 def test_published_values_are_markers_of_another_kind_with_their_source(page):
+    assert not page.is_checked("#published") and traces(page, "published") == []  # until they are asked for
+    page.select_option("#axis", "difference")
     page.check("#published")
+    assert page.input_value("#axis") == "value"  # they are no differences
     (timed,), (untimed,) = traces(page, "published"), traces(page, "published without a cost")
     costs = {entry["published"]["method"]: x for entry, x in zip(timed["customdata"], timed["x"], strict=True)}
     assert costs["VisionNeRF"] == pytest.approx(0.015 + 4 * 0.678)
@@ -257,8 +248,12 @@ def test_published_values_are_markers_of_another_kind_with_their_source(page):
 
 def test_hovering_shows_the_overrides(page):
     said = hover(page, *place(page, NAMES.index("slow")))
-    assert "budget.inner_steps=8" in said and "ckpt=demo" in said and "seed=" not in said
+    assert "budget.inner_steps=8" in said and "ckpt=demo" not in said and "seed=" not in said
     assert "21.90" in said and "2 more failed" in said
+    page.wait_for_function("document.querySelector('#tip img').naturalWidth > 0")  # a thumbnail, within the page
+    assert page.get_attribute("#tip img", "src").startswith("data:image/webp")
+    said = hover(page, *place(page, NAMES.index("best")))  # without pictures there is room for all
+    assert "budget.inner_steps=16" in said and "ckpt=demo" in said and page.locator("#tip img").count() == 0
 
 
 def test_clicking_shows_pictures_and_the_command(page):
@@ -299,7 +294,7 @@ def test_the_advice_is_the_fastest_within_x_of_the_best(page, metric):
         assert page.get_attribute("#advice", "data-pick") == str(NAMES.index(expected))
         told.add(expected)
     assert len(told) > 2
-    page.locator("#advice a").first.click()
+    page.locator("#advice button").first.click()
     assert page.locator("#details pre").inner_text() == result(expected).command
 
 
@@ -314,7 +309,7 @@ def test_failed_runs_say_why(page):
 
 def wait_for_rows(page, steps: list[str]) -> None:
     """Until the table's rows are these, by their inner steps."""
-    cells = "[...document.querySelectorAll('#table tbody tr td:nth-child(3)')].map((cell) => cell.innerText).join()"
+    cells = "[...document.querySelectorAll('#table tbody tr td:nth-child(6)')].map((cell) => cell.innerText).join()"
     page.wait_for_function(f"{cells} === '{','.join(steps)}'")
 
 
@@ -365,8 +360,8 @@ def test_words_of_overrides_are_text_and_no_elements(open_page, tmp_path):
     page = open_page(chart(write_results(tmp_path, *rows, failed("slow", strategy=None))))
     assert {text for text in page.locator("#table tbody td").all_inner_texts() if "<" in text} == set(names)
     page.select_option("#colour", "run_name")
-    page.wait_for_function("document.querySelectorAll('.legendtext').length > 3")
-    assert set(names) < set(page.locator(".legendtext").all_text_contents()) and page.locator("#plot a").count() == 0
+    assert set(names) < set(page.locator("#legend .name").all_inner_texts())
+    assert page.locator("#legend a, #legend b, #legend img, #plot a").count() == 0
     page.locator("#failed-strip button").click()
     assert page.inner_text("#details h2") == "oom"
     assert page.locator("#table img, #table b").count() == 0 and page.complaints == []

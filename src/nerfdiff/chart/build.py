@@ -3,7 +3,7 @@
 import logging
 import os
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from nerfdiff.chart.marks import KINDS, OTHER, Mark, marks_of
 from nerfdiff.chart.page import write_page
 from nerfdiff.chart.payload import (
     Measured,
@@ -25,6 +26,7 @@ from nerfdiff.chart.payload import (
 from nerfdiff.chart.pictures import SmallSheets
 from nerfdiff.chart.png import write_png
 from nerfdiff.chart.published import published_for, read_published
+from nerfdiff.chart.spending import is_adaptive, spending_values, spent_by
 from nerfdiff.chart.stability import stability_values
 from nerfdiff.cli import command_words
 from nerfdiff.metrics.table import METRICS, reward_note
@@ -48,10 +50,12 @@ log = logging.getLogger(__name__)
 
 HOW = (
     "A point is a configuration: runs that agree in everything but their seed. Its name has what tells it from the "
-    "others, a click shows all of its settings. Intervals of qualities measured per scene are {level:.0%} bootstrap "
-    "intervals over scenes and seeds; of Fréchet distances, counts and sizes the range over seeds. Seconds are the "
-    "mean over seeds of the medians; their intervals span the median ± half the interquartile range of every seed. "
-    "Faint points are dominated: another is at least as good and as cheap, and better in one. Rings: some runs failed."
+    "others, a click shows all of its settings. Bars are {level:.0%} bootstrap intervals of the difference to "
+    "{reference} with the same model, scene by scene, over scenes; the seeds of a scene are averaged first. Better or "
+    "worse is what its interval says; whatever reaches over zero is level. Fréchet distances are one number of a run, "
+    "and fewer than {fewest} scenes are too few: they have no interval. Seconds are the mean over seeds of the medians "
+    "over scenes. The frontier is that of means; faint points are dominated: another is at least as good and as cheap, "
+    "and better in one. Hollow: some runs failed."
 )
 """The page's words on its numbers."""
 
@@ -95,7 +99,8 @@ def build_chart(cfg: DictConfig) -> Path:
     metrics, costs = charted(), _plain(cfg.costs)
     bootstrap = instantiate(cfg.bootstrap)
     plain_runs = [run for run in found.runs if run.row.stress is None]  # stressed ones are no choice of speed
-    content = measured(configurations(plain_runs, bootstrap, found.warn), metrics, costs, cfg.unnamed)
+    own = configurations(plain_runs, bootstrap, found.warn)
+    content = measured(own, metrics, costs, cfg.unnamed, _plain(cfg.picks), bootstrap)
     papers = read_published(cfg.published)
     published = [published_for(panel, **papers) for panel in content.panels]
     failed = failures(plain_runs)
@@ -103,8 +108,10 @@ def build_chart(cfg: DictConfig) -> Path:
     stability = stability_values(studies(found.runs, stress_files(), rules, breaking), out, cfg.pictures.strip_views)
 
     page = out / "index.html"
-    small = SmallSheets(cfg.pictures.width, cfg.pictures.megabytes, cfg.pictures.megapixels, found.warn)
+    sizes = cfg.pictures
+    small = SmallSheets(sizes.width, sizes.height, sizes.megabytes, sizes.megapixels, found.warn)
     values = _values(out, content, published, failed, small)
+    _add_spending(values["configurations"], content, cfg.picks.fidelity, cfg.spending_scenes, found.warn)
     write_csv(out / "configurations.csv", configuration_columns(), map(configuration_line, content.found))
     write_csv(out / "runs.csv", list(dict.fromkeys(("results", *COLUMNS, *METRICS))), run_lines(found.runs))
     pictures = _pngs(cfg, out, content, published)
@@ -117,7 +124,10 @@ def build_chart(cfg: DictConfig) -> Path:
             "metrics": metrics,
             "costs": costs,
             "counts": f"{counts}; {datetime.now(UTC):%d %B %Y}",
-            "how": HOW.format(level=bootstrap.level),
+            "how": HOW.format(level=bootstrap.level, reference=cfg.picks.reference, fewest=cfg.picks.fewest_scenes),
+            "kinds": KINDS,
+            "other": OTHER,
+            "marks": {name: [mark.colour, mark.shape] for name, mark in _marks(content).items()},
             "webgl_above": cfg.webgl_above,
             "unread": found.unread,
             "stability": stability,
@@ -197,8 +207,11 @@ def _values(
     lost = [failure_values(run) for run in failed]
     panels = [
         {"device": p.device, "cpu": p.cpu, "test": p.data, "members": p.members}
-        | {"published": entries, "frontiers": frontiers}
-        for p, entries, frontiers in zip(content.panels, published, content.frontiers, strict=True)
+        | {"published": entries, "frontiers": every, "frontiers_3d": solid}
+        | {"reference": content.reference(p), "answers": answers}
+        for p, entries, every, solid, answers in zip(
+            content.panels, published, content.frontiers, content.frontiers_3d, content.answers, strict=True
+        )
     ]
     return {
         "words": share_words([*shown, *lost]),
@@ -208,15 +221,33 @@ def _values(
     }
 
 
+def _marks(content: Measured) -> dict[str, Mark]:
+    return marks_of(configuration.row.strategy or "?" for configuration in content.found)
+
+
+def _add_spending(
+    entries: Sequence[dict[str, Any]], content: Measured, fidelity: str, points: int, warn: Callable[[str], object]
+) -> None:
+    """What each scene took beside its difficulty, of the first configurations, `points` scenes of them in all."""
+    for number, entry in enumerate(entries):
+        reference = content.references[number]
+        difficulty = {} if reference is None else content.found[reference].scenes.get(fidelity, {})
+        spent = [spent_by(run, warn) for run in content.found[number].runs] if points > 0 else []
+        points -= sum(map(len, spent))
+        entry["adaptive"] = is_adaptive(content.found[number], spent)
+        entry["spending"] = spending_values(spent, difficulty)
+
+
 def _pngs(cfg: DictConfig, out: Path, content: Measured, published: Sequence[list[dict[str, Any]]]) -> list[Path]:
     costs = {cost["field"]: cost for cost in _plain(cfg.costs)}
     if unknown := set(cfg.png.costs) - costs.keys():
         raise ConfigError(f"png.costs: {', '.join(sorted(unknown))} is not among the fields of costs")
     written = []
-    for number, (panel, entries) in enumerate(zip(content.panels, published, strict=True), 1):
+    for number, (panel, papers) in enumerate(zip(content.panels, published, strict=True), 1):
+        entries = papers if cfg.png.published else ()
         for metric in charted():
             for cost in cfg.png.costs:
-                if content.points(panel, metric["field"], cost):
+                if content.points(panel, metric["field"], cost, only_3d=True):
                     path = out / f"{metric['field']}-{cost}{f'-{number}' * (number > 1)}.png"
                     png = (path, content, panel, metric, costs[cost], entries, cfg.png.size, cfg.png.dpi, cfg.png.lines)
                     written.append(write_png(*png))

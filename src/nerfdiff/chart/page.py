@@ -12,7 +12,23 @@ from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.files import write_text
 
 PARTS = Path(__file__).parent / "page"
-SCRIPTS = ("state", "colours", "axes", "plot", "tip", "details", "pick", "cards", "table", "stability", "main")
+SCRIPTS = (
+    *(
+        "state",
+        "colours",
+        "axes",
+        "legend",
+        "plot",
+        "tip",
+        "spending",
+        "details",
+        "pick",
+        "cards",
+        "table",
+        "stability",
+    ),
+    *("keys", "main"),
+)
 
 
 def write_page(path: Path, title: str, content: dict[str, Any]) -> None:

@@ -47,13 +47,14 @@ class SmallSheets:
     """Contact sheets as data URLs, to carry within the page.
 
     Args:
-        width: pixels that one has at most.
+        width, height: pixels that one has at most; of a longer one the top is shown.
         megabytes: that all have together at most; then there are no more.
         megapixels: a larger picture is not opened.
         warn: is told of sheets that cannot be shown.
     """
 
     width: int
+    height: int
     megabytes: float
     megapixels: float
     warn: Callable[[str], object]
@@ -80,7 +81,8 @@ class SmallSheets:
                     if width * height > self.megapixels * 1e6:
                         raise OSError(f"{width}×{height} pixels are more than pictures.megapixels={self.megapixels:g}")
                     image = image.convert("RGB")
-                    image.thumbnail((self.width, 4 * self.width))
+                    image.thumbnail((self.width, height))
+                    image = image.crop((0, 0, image.width, min(image.height, self.height)))
                     file = io.BytesIO()
                     image.save(file, "WEBP", quality=WEBP_QUALITY)
         except Exception as error:  # of whatever damage the decoder stumbles over

@@ -11,6 +11,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from nerfdiff.chart.against import has_interval
+from nerfdiff.chart.marks import Mark, marks_of
 from nerfdiff.chart.panels import Panel
 from nerfdiff.chart.payload import Measured
 from nerfdiff.results.intervals import Estimate
@@ -18,8 +20,8 @@ from nerfdiff.results.text import figure_text, one_line
 from nerfdiff.utils.files import atomic
 
 INK, PAPERS = "#1d2430", "#6b4a00"
-KINDS = ("#0b62b8", "#d1570a", "#1a8a5a", "#8a4fbf", "#b3261e", "#0f8fa3", "#8a6d1d", "#c2408f", "#5d8a00", "#5c6675")
 FAINT = 0.3
+MOST = 12  # strategies in the legend
 LONGEST, SHORT = 400, 40  # letters of a name below the axes, and in the legend
 LINE, LETTERS = 0.16, 18  # inches of a line below the axes, and letters of it to an inch
 
@@ -35,9 +37,10 @@ def write_png(
     dpi: int,
     lines: int,
 ) -> Path:
-    """One panel's chart of one metric against one cost, coloured by strategy; dominated points are faint.
+    """One panel's chart of one metric against one cost; dominated points are faint.
 
-    The frontier's points have numbers, which lines below the axes explain.
+    As on the page, it has those alone that leave a field (unless none does), and bars are intervals of differences to
+    the reference, whose own value is a broken line. The frontier's points have numbers, which lines below explain.
 
     Args:
         published: of which those that have both numbers are drawn.
@@ -47,8 +50,8 @@ def write_png(
     Raises:
         DataError: the file cannot be written.
     """
-    best = content.frontiers[content.panels.index(panel)][metric["field"]][cost["field"]]
-    points = content.points(panel, metric["field"], cost["field"])
+    best = content.frontiers_3d[content.panels.index(panel)][metric["field"]][cost["field"]]
+    points = content.points(panel, metric["field"], cost["field"], only_3d=True)
     at = {n: (content.estimates[n][cost["field"]], content.estimates[n][metric["field"]]) for n in points}
     told = [_told(number, content.names[n], at[n], metric, cost) for number, n in enumerate(best[:lines], 1)]
     if len(best) > lines:
@@ -58,11 +61,14 @@ def write_png(
     figure = Figure(figsize=(size[0], height), dpi=dpi, layout="constrained")
     axes = figure.subplots()
     _scale(axes, [at[n][0].mean for n in points])
-    kinds = _kinds({n: content.found[n].row.strategy or "?" for n in points})
-    shown = set(best)
-    for (_, own), colour in zip(kinds, KINDS, strict=False):
-        _errorbars(axes, [at[n] for n in own if n not in shown], colour, FAINT)
-        _errorbars(axes, [at[n] for n in own if n in shown], colour, 1)
+    marks = marks_of(configuration.row.strategy or "?" for configuration in content.found)
+    strategies = {n: content.found[n].row.strategy or "?" for n in points}
+    for n in points:
+        bar = _bar(content.differences[n].get(metric["field"]))
+        _point(axes, at[n], bar, marks[strategies[n]], 1 if n in best else FAINT)
+    reference = content.reference(panel)
+    if reference in at:
+        axes.axhline(at[reference][1].mean, color=INK, linewidth=0.8, linestyle=(0, (4, 4)), zorder=0)
     for number, n in enumerate(best[:lines], 1):
         place = (at[n][0].mean, at[n][1].mean)
         axes.annotate(str(number), place, (-5, 5), textcoords="offset points", ha="right", fontsize=8, color=INK)
@@ -74,10 +80,13 @@ def write_png(
         axes.invert_yaxis()
     axes.grid(alpha=0.25)
     axes.set_title(figure_text(fill(one_line(f"{panel.device}: {panel.data}", LONGEST), int(12 * size[0]))), fontsize=9)
+    shown = sorted(set(strategies.values()))
     dots = [
-        Line2D([], [], color=colour, marker="o", ls="", label=figure_text(one_line(name, SHORT)))
-        for (name, _), colour in zip(kinds, KINDS, strict=False)
+        Line2D([], [], color=marks[name].colour, marker=marks[name].marker, ls="", label=_short(name))
+        for name in shown[:MOST]
     ]
+    if len(shown) > MOST:
+        dots.append(Line2D([], [], ls="", label=f"and {len(shown) - MOST} others"))
     axes.legend(handles=dots, fontsize=7, loc="best")
     key = [Line2D([], [], ls="", label=text) for text in told]
     figure.legend(handles=key, loc="outside lower left", fontsize=7, frameon=False, handlelength=0, labelspacing=0.2)
@@ -87,16 +96,8 @@ def write_png(
     return path
 
 
-def _kinds(strategies: Mapping[int, str]) -> list[tuple[str, list[int]]]:
-    """The points of each strategy, by name; where there are more than colours, the last kind has all others."""
-    members: dict[str, list[int]] = {}
-    for number, strategy in strategies.items():
-        members.setdefault(strategy, []).append(number)
-    kinds = sorted(members.items())
-    if len(kinds) > len(KINDS):
-        rest = kinds[len(KINDS) - 1 :]
-        kinds[len(KINDS) - 1 :] = [(f"{len(rest)} others", [number for _, own in rest for number in own])]
-    return kinds
+def _short(name: str) -> str:
+    return figure_text(one_line(name, SHORT))
 
 
 def _titled(quantity: Mapping[str, Any]) -> str:
@@ -122,18 +123,17 @@ def _steps(axes: Axes, places: Sequence[tuple[float, float]]) -> None:
     axes.set_xlim(low, high)
 
 
-def _errorbars(axes: Axes, points: Sequence[tuple[Estimate, Estimate]], colour: str, alpha: float) -> None:
-    if not points:
-        return
-    x, y = ([point[axis].mean for point in points] for axis in (0, 1))
-    ends = [[list(side) for side in zip(*(_ends(point[axis]) for point in points), strict=True)] for axis in (0, 1)]
-    axes.errorbar(x, y, xerr=ends[0], yerr=ends[1], fmt="o", color=colour, alpha=alpha, markersize=5, elinewidth=0.8)
+def _point(axes: Axes, point: tuple[Estimate, Estimate], bar: tuple[float, float], mark: Mark, alpha: float) -> None:
+    ends = [[end] for end in bar]
+    style = {"fmt": mark.marker, "color": mark.colour, "markersize": 6, "elinewidth": 0.8}
+    axes.errorbar([point[0].mean], [point[1].mean], yerr=ends, alpha=alpha, **style)
 
 
-def _ends(estimate: Estimate) -> tuple[float, float]:
-    if estimate.low is None or estimate.high is None:
+def _bar(difference: Estimate | None) -> tuple[float, float]:
+    """How far the interval of a difference reaches below and above it."""
+    if difference is None or not has_interval(difference):
         return 0.0, 0.0
-    return max(estimate.mean - estimate.low, 0.0), max(estimate.high - estimate.mean, 0.0)
+    return max(difference.mean - difference.low, 0.0), max(difference.high - difference.mean, 0.0)
 
 
 def _scale(axes: Axes, costs: Sequence[float]) -> None:

@@ -12,6 +12,7 @@ from nerfdiff.utils.errors import DataError
 from nerfdiff.utils.files import atomic
 
 FACTS = ("scene", "views", "status", "verdict", "blank")  # of a scene, beside its metrics
+SPENT = ("distill", "denoiser_calls", "field_queries", "steps")  # on a scene: seconds and counts
 LARGEST = 2**21  # bytes of a file of scores: of some 10,000 scenes
 
 Value = float | int | str | None
@@ -116,7 +117,11 @@ def read_scores(path: Path) -> dict[str, dict[str, float]]:
             raise ValueError(f"{size} bytes are too many" if path.is_file() else "no file")
         with open(path, newline="", encoding="utf-8") as file:
             return {
-                line["scene"]: {name: float(cell) for name, cell in line.items() if name not in FACTS and cell}
+                line["scene"]: {
+                    name: float(cell)
+                    for name, cell in line.items()
+                    if name not in (*FACTS, *SPENT, "stopped_by") and cell
+                }
                 for line in csv.DictReader(file)
             }
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:

@@ -4,7 +4,7 @@ import json
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from nerfdiff.metrics.summary import read_scores
 from nerfdiff.metrics.table import METRICS, named
 from nerfdiff.results.inside import inside
 from nerfdiff.results.intervals import Bootstrap, Estimate, spread
+from nerfdiff.results.paired import SceneValues, over_seeds
 from nerfdiff.results.row import RESULTS, ResultRow, RowFile, flatten
 from nerfdiff.utils.errors import DataError
 
@@ -28,6 +29,8 @@ IDENTITY = (
     "strategy", "prior", "K", "samples_per_ray", "backend", "compile", "scenes_at_once", "precision", "device", "cpu",
     "stress", "severity",
 )  # fmt: skip
+
+Scores = dict[str, dict[str, float]]
 
 
 @dataclass(frozen=True)
@@ -142,11 +145,13 @@ class Configuration:
             seeds and their range. Timings: the mean over seeds of the medians, and of median ± half the interquartile
             range the lowest and the highest of any seed. Counts (per scene) and sizes: the mean over seeds and their
             range.
+        scenes: of the qualities that have them, the values of every scene: the means over seeds.
     """
 
     runs: tuple[Run, ...]
     failed: int
     estimates: dict[str, Estimate]
+    scenes: dict[str, SceneValues] = field(default_factory=dict)
 
     @property
     def row(self) -> ResultRow:
@@ -182,7 +187,9 @@ def configurations(
     for members in groups.values():
         attempt, devices = _attempt(members[0]), {members[0].device, None}
         failed = sum(failures.get((attempt, device), 0) for device in devices)
-        found.append(Configuration(tuple(members), failed, _estimates(members, bootstrap, warn)))
+        scores = [_read_scenes(run, warn) for run in members]
+        estimates = _estimates(members, scores, bootstrap)
+        found.append(Configuration(tuple(members), failed, estimates, over_seeds(scores)))
     return found
 
 
@@ -223,7 +230,7 @@ def _attempt(run: Run) -> tuple:
     return run.settings, run.row.strategy
 
 
-def _estimates(runs: Sequence[Run], bootstrap: Bootstrap, warn: Callable[[str], object]) -> dict[str, Estimate]:
+def _estimates(runs: Sequence[Run], scores: Sequence[Scores], bootstrap: Bootstrap) -> dict[str, Estimate]:
     found = {}
     for name in (*METRICS, *COUNTS, *SIZES):
         values = [value for run in runs if (value := _value(run.row, name)) is not None]
@@ -237,7 +244,7 @@ def _estimates(runs: Sequence[Run], bootstrap: Bootstrap, warn: Callable[[str], 
             found[name] = Estimate(
                 float(np.mean(medians)), max(0.0, min(low for low, _ in ends)), max(high for _, high in ends)
             )
-    names, values = _per_scene(runs, warn)
+    names, values = _per_scene(scores)
     return found | dict(zip(names, bootstrap.over_seeds_and_scenes(values) if names else (), strict=True))
 
 
@@ -248,9 +255,8 @@ def _value(row: ResultRow, name: str) -> float | None:
     return value / row.n_scenes if name in COUNTS else float(value)
 
 
-def _per_scene(runs: Sequence[Run], warn: Callable[[str], object]) -> tuple[list[str], np.ndarray]:
-    """Names of metrics, and their values (metrics, seeds, scenes) where every scene of every run has one."""
-    scores = [_read_scenes(run, warn) for run in runs]
+def _per_scene(scores: Sequence[Scores]) -> tuple[list[str], np.ndarray]:
+    """Names of metrics, and their values (metrics, seeds, scenes) where every scene of every seed has one."""
     scenes = sorted(set.intersection(*map(set, scores)))
     per_scene = named("image", "scene")
     names = [name for name in per_scene if scenes and all(name in seed[scene] for seed in scores for scene in scenes)]
@@ -258,7 +264,7 @@ def _per_scene(runs: Sequence[Run], warn: Callable[[str], object]) -> tuple[list
     return names, np.array(values, dtype=np.float64)
 
 
-def _read_scenes(run: Run, warn: Callable[[str], object]) -> dict[str, dict[str, float]]:
+def _read_scenes(run: Run, warn: Callable[[str], object]) -> Scores:
     """Read the scores of each scene; empty where they are no longer beside the results."""
     path = run.file("scores", str(run.row.strategy), "per_scene.csv")
     if path is None:

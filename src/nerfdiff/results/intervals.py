@@ -45,7 +45,7 @@ class Bootstrap:
         mean = float(values.mean())
         if len(values) < 2:
             return Estimate(mean)
-        drawn = np.random.default_rng(self.seed).integers(len(values), size=(self.resamples, len(values)))
+        drawn = _drawn(self.seed, self.resamples, len(values))
         tails = (1 - self.level) / 2
         with np.errstate(invalid="ignore"):
             low, high = np.quantile(values[drawn].mean(axis=1), [tails, 1 - tails])
@@ -75,6 +75,11 @@ class Bootstrap:
                 low, high = np.quantile(self.means(own), [tails, 1 - tails])
             found.append(Estimate(float(mean), float(low), float(high)))
         return found
+
+
+@lru_cache(maxsize=4)
+def _drawn(seed: int, draws: int, among: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(among, size=(draws, among))
 
 
 @lru_cache(maxsize=4)

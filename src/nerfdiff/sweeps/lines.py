@@ -4,18 +4,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from nerfdiff.metrics.summary import read_scores
 from nerfdiff.metrics.table import named
-from nerfdiff.results.intervals import Bootstrap, Estimate, mean_of, spread
+from nerfdiff.results.intervals import Bootstrap, Estimate, spread
+from nerfdiff.results.paired import difference, in_order, over_seeds
 from nerfdiff.results.row import ResultRow
-from nerfdiff.sweeps.jobs import Group, Job, Labels, counterpart
+from nerfdiff.sweeps.jobs import Group, Labels, counterpart
 from nerfdiff.utils.errors import DataError
 
 TIMINGS = ("distill_s", "scene_s")
-
-SceneValues = dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -65,7 +62,7 @@ def lines_of(
     values, lost = [], []
     for group in groups:
         try:
-            values.append(over_seeds(group.succeeded))
+            values.append(over_seeds([read_scores(job.own("scores", "per_scene.csv")) for job in group.succeeded]))
             lost.append(None)
         except DataError as error:
             values.append({})
@@ -76,7 +73,9 @@ def lines_of(
         other, aim = counterpart(group, groups, reference), counterpart(group, groups, goal)
         differences, closed = {}, {}
         if other is not None and other is not group:
-            differences = _differences(scenes, values[groups.index(other)], bootstrap)
+            theirs = values[groups.index(other)]
+            found = {name: difference(own, theirs.get(name, {}), bootstrap) for name, own in scenes.items()}
+            differences = {name: estimate for name, estimate in found.items() if estimate is not None}
             if aim is not None:
                 closed = _closed(runs, sets[groups.index(other)], sets[groups.index(aim)])
         lines.append(
@@ -88,7 +87,7 @@ def lines_of(
                 status=_status(group),
                 error=_error(group, lost[number]),
                 fallbacks=sum(job.row.fallbacks or 0 for job in group.succeeded),
-                metrics={metric: bootstrap(_array(by_scene)) for metric, by_scene in scenes.items()}
+                metrics={metric: bootstrap(in_order(by_scene)) for metric, by_scene in scenes.items()}
                 | (_per_run([job.row for job in group.succeeded], named("image", "scene")) if lost[number] else {})
                 | runs,
                 differences=differences,
@@ -99,48 +98,12 @@ def lines_of(
     return lines
 
 
-def over_seeds(jobs: Sequence[Job]) -> dict[str, SceneValues]:
-    """The mean over seeds of each metric in each scene, of scenes where all seeds have it.
-
-    Raises:
-        DataError: the scores of a job are missing or damaged.
-    """
-    read = [_by_metric(read_scores(job.own("scores", "per_scene.csv"))) for job in jobs]
-    values = {}
-    for metric in read[0] if read else ():
-        common = [scene for scene in read[0][metric] if all(scene in seed.get(metric, {}) for seed in read)]
-        if common:
-            values[metric] = {scene: mean_of([seed[metric][scene] for seed in read]) for scene in common}
-    return values
-
-
-def _by_metric(scores: Mapping[str, Mapping[str, float]]) -> dict[str, SceneValues]:
-    values: dict[str, SceneValues] = {}
-    for scene, measured in scores.items():
-        for metric, value in measured.items():
-            values.setdefault(metric, {})[scene] = value
-    return values
-
-
 def _per_run(rows: Sequence[ResultRow], names: Sequence[str]) -> dict[str, Estimate]:
     found = {}
     for name in names:
         values = [value for row in rows if (value := row.measured(name)) is not None]
         if values:
             found[name] = spread([float(value["median"] if isinstance(value, dict) else value) for value in values])
-    return found
-
-
-def _differences(
-    scenes: Mapping[str, SceneValues], others: Mapping[str, SceneValues], bootstrap: Bootstrap
-) -> dict[str, Estimate]:
-    """Scene by scene, so that what makes a scene hard cancels."""
-    found = {}
-    for metric, by_scene in scenes.items():
-        theirs = others.get(metric, {})
-        by_scene = {scene: value - theirs[scene] for scene, value in by_scene.items() if scene in theirs}
-        if by_scene:
-            found[metric] = bootstrap(_array(by_scene))
     return found
 
 
@@ -165,11 +128,6 @@ def _error(group: Group, lost: str | None) -> str | None:
     """Join the jobs' errors, each once; scenes that fell back in jobs that succeeded count too."""
     said = dict.fromkeys(job.row.error for job in group.jobs if job.row and job.row.error)
     return "; ".join(filter(None, [*said, lost])) or None
-
-
-def _array(values: SceneValues) -> np.ndarray:
-    # in the order of their names: the draws of scenes are then the same for every metric and group
-    return np.array([values[scene] for scene in sorted(values)])
 
 
 def _numbers(entry: Mapping[str, Any]) -> dict[str, float]:

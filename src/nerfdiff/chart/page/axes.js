@@ -2,9 +2,9 @@
 const wide = window.matchMedia("(min-width: 801px)"); // as in style.css
 const WIDE = () => wide.matches;
 
-// The axis of the costs `found` and of the ends of their intervals: its range in powers of ten, and where a cost stands.
-function costAxis(found, intervals, room) {
-  const positive = [...found, ...intervals].filter((cost) => cost > 0);
+// The axis of the costs `found`: its range in powers of ten, and where a cost stands.
+function costAxis(found, room) {
+  const positive = found.filter((cost) => cost > 0);
   const [low, high] = positive.length ? [Math.min(...positive), Math.max(...positive)] : [1, 1];
   const zero = found.some((cost) => !(cost > 0)) ? low / 3 : null;
   const ends = [Math.log10(zero ?? low), Math.log10(high)], short = Math.max(0.4 - (ends[1] - ends[0]), 0) / 2;
@@ -33,10 +33,14 @@ function metricAxis(found) {
   const [low, high] = [Math.min(...found), Math.max(...found)];
   const pad = 0.06 * (high - low || Math.abs(high) || 1);
   const up = [low - pad, high + pad];
-  const text = `${name}${unit ? `, ${unit}` : ""}${better === "higher" ? "" : " (axis inverted: up is better)"}`;
+  const shown = byDifference() ? `${name}, difference to ${nameOf(panel().reference)}` : name;
+  const text = `${shown}${unit ? `, ${unit}` : ""}${better === "higher" ? "" : " (up is better)"}`;
   const range = better === "higher" ? up : up.reverse();
-  return { range, title: { text, standoff: 8 }, gridcolor: "#e8ecf1", zeroline: false, nticks: 8 };
+  return { range, title: { text: markup(text), standoff: 8 }, gridcolor: "#e8ecf1", zeroline: false, nticks: 8, tickformat: byDifference() ? "+" : "" };
 }
+
+// Plotly takes text for markup.
+const markup = (text) => text.replaceAll("&", "&amp;").replaceAll("<", "&lt;");
 
 // Pixels from each label's marker to the label, so that labels in a column do not cover each other.
 function spreadLabels(values, range, height, line) {

@@ -1,6 +1,6 @@
 // A small chart per metric, which is also how one chooses it.
 function drawCards() {
-  const there = data.metrics.filter(({ field }) => panel().members.some((number) => value(number, field)));
+  const there = data.metrics.filter(({ field }) => members().some((number) => value(number, field)));
   $("metrics").replaceChildren(...there.map(({ field, name, better }) => {
     const canvas = element("canvas", { width: 268, height: 88 });
     const best = frontierOf(field, state.cost).at(-1);
@@ -17,7 +17,7 @@ function drawCards() {
 
 function sketch(canvas, field) {
   const pen = canvas.getContext("2d"), better = sign(field);
-  const found = panel().members.filter((number) => value(number, field) && value(number, state.cost));
+  const found = members().filter((number) => value(number, field) && value(number, state.cost));
   if (!found.length) return;
   const costs = found.map((number) => mean(number, state.cost)).filter((cost) => cost > 0);
   const least = costs.reduce((a, b) => Math.min(a, b), Infinity) / 3;

@@ -1,11 +1,29 @@
-// A colour for every value of the setting that points are coloured by.
-const KINDS = ["#0b62b8", "#d1570a", "#1a8a5a", "#8a4fbf", "#b3261e", "#0f8fa3", "#8a6d1d", "#c2408f", "#5c6675", "#5d8a00"];
+// A colour for every value of the setting that points are coloured by; a shape for every strategy.
+const KINDS = data.kinds, OTHER = data.other;
 const SCALE = ["#440154", "#414487", "#2a788e", "#22a884", "#7ad151", "#c9a800"];
-const OTHER = "#9aa3af";
 const TOLD = 8; // numbers in the legend at most, of which people see the scale between
 const UNSET = "not set";
 
-const colourValue = (number) => data.configurations[number].labels[state.colour] ?? UNSET;
+const shapeOf = (number) => data.marks[data.configurations[number].strategy][1];
+
+// Beside the labels: the kind of field, which a checkpoint's name may hide, and whether the budget follows the scene.
+const FACTS = {
+  strategy: (entry) => entry.strategy,
+  field: (entry) => entry.labels.field ?? entry.field,
+  budget: (entry) => entry.labels.budget ?? (entry.adaptive ? "adaptive" : "fixed"),
+};
+const colourValue = (number) => {
+  const entry = data.configurations[number];
+  return (FACTS[state.colour] ? FACTS[state.colour](entry) : entry.labels[state.colour]) ?? UNSET;
+};
+
+function colourKeys() {
+  const entries = panel().members.map((number) => data.configurations[number]);
+  const keys = new Set(["strategy", ...entries.flatMap(({ labels }) => Object.keys(labels))]);
+  if (entries.some(({ field }) => field)) keys.add("field");
+  if (entries.some(({ adaptive }) => adaptive)) keys.add("budget");
+  return [...keys];
+}
 
 function mix(share) {
   const place = share * (SCALE.length - 1), low = Math.min(Math.floor(place), SCALE.length - 2);
@@ -15,9 +33,11 @@ function mix(share) {
 }
 
 // {numeric, groups}, the groups in the order of the legend: numbers along a scale, of which not all stand there, or words
-// by kind, of which those beyond the colours are one.
+// by kind, of which those beyond the colours are one. Strategies have the colours of their marks, in every panel.
 function colouring(numbers) {
   const found = [...new Set(numbers.map(colourValue))];
+  if (state.colour === "strategy")
+    return { numeric: false, groups: found.sort().map((word) => ({ words: [word], colour: data.marks[word][0], legend: word })) };
   const numeric = found.filter((word) => word !== UNSET && word !== "" && isFinite(word)).sort((a, b) => a - b);
   const unset = found.includes(UNSET) ? [{ words: [UNSET], colour: OTHER, legend: UNSET }] : [];
   if (numeric.length > 1 && numeric.length >= found.filter((word) => word !== UNSET).length) {

@@ -1,22 +1,22 @@
 // What is known of a configuration or of a failed run: numbers, pictures, overrides, commands.
 function panelOf(title, ...content) {
-  const close = element("button", { className: "close", type: "button", textContent: "✕", title: "close", onclick: () => choose(null) });
+  const close = element("button", { className: "close", type: "button", textContent: "✕", title: "close (Escape)", ariaLabel: "close", onclick: () => choose(null) });
   $("details").replaceChildren(close, element("h2", {}, title), ...content.filter(Boolean));
   $("details").hidden = false;
   $("details").scrollTop = 0;
 }
 
 function numbers(number) {
+  const { reference } = data.configurations[number], compared = reference !== null && reference !== number;
   const rows = [...data.metrics, ...data.costs].filter(({ field }) => value(number, field));
-  const line = (name, text) => element("tr", {}, element("th", {}, name), element("td", {}, text));
-  return element("table", {}, ...rows.map(({ field, name }) => line(name, estimate(field, value(number, field)))));
+  const cells = (tag, texts) => element("tr", {}, ...texts.map((text, at) => element(at ? tag : "th", {}, text)));
+  const line = ({ field, name }) => [name, plain(field, mean(number, field)), ...(compared ? [metricOf(field) ? differenceText(number, field, false) : ""] : [])];
+  return element("table", {}, ...(compared ? [cells("th", ["", "", `to ${referenceName(number)}`])] : []), ...rows.map((row) => cells("td", line(row))));
 }
 
 function commandOf(run) {
   if (!run.command) return element("p", { className: "note" }, "Its command was not recorded.");
-  const copy = element("button", { type: "button", textContent: "copy" });
-  copy.onclick = () => navigator.clipboard.writeText(run.command).then(() => (copy.textContent = "copied"));
-  return element("div", {}, element("pre", { className: "command" }, run.command), navigator.clipboard ? copy : null);
+  return element("div", {}, element("pre", { className: "command" }, run.command), copyButton(run.command, "copy"));
 }
 
 function picturesOf(run, small) {
@@ -61,7 +61,7 @@ function showConfiguration(number, seed = 0) {
   const pictures = picturesOf(run, seed === 0 ? entry.small : null);
   const { strategy, ...others } = entry.labels;
   const all = Object.entries(others).map(([key, word]) => `${key}=${word}`).join("  ");
-  panelOf(nameOf(number), element("p", { className: "words" }, all), failed, fell, seeds, ...pictures, commandOf(run), numbers(number), overrideList(entry));
+  panelOf(nameOf(number), element("p", { className: "words" }, all), failed, fell, seeds, ...pictures, commandOf(run), numbers(number), spending(number), overrideList(entry));
 }
 
 function showFailure(entry) {

@@ -5,12 +5,24 @@ function fill(select, options, chosen) {
   select.disabled = options.length < 2;
 }
 
+let opener = null; // what had the keyboard's attention before the details opened
+
 function choose(number, scroll = false) {
   state.chosen = number;
-  if (number === null) $("details").hidden = true;
-  else showConfiguration(number);
+  if (number === null) closeDetails();
+  else {
+    if ($("details").hidden) opener = document.activeElement;
+    showConfiguration(number);
+    if (byKeyboard) $("details").querySelector(".close").focus();
+  }
   drawAll();
   if (scroll && WIDE()) $("view").scrollIntoView({ behavior: "smooth", block: "nearest" });
+}
+
+function closeDetails() {
+  const within = $("details").contains(document.activeElement);
+  $("details").hidden = true;
+  if (within) (opener?.isConnected ? opener : $("plot")).focus();
 }
 
 function firstOf(all, there, wanted) {
@@ -20,7 +32,7 @@ function firstOf(all, there, wanted) {
 
 // After the device or the test images changed: what is not there any more gives way to what is.
 function settle() {
-  const members = panel().members, has = (field) => members.some((number) => value(number, field));
+  const own = members(), has = (field) => own.some((number) => value(number, field));
   state.metric = firstOf(data.metrics, has, state.metric);
   state.cost = firstOf(data.costs, has, state.cost);
   const devices = [...new Set(data.panels.map(({ device }) => device))];
@@ -28,10 +40,20 @@ function settle() {
   const tests = data.panels.map(({ device, test }, at) => [device, String(at), test]).filter(([device]) => device === panel().device);
   fill($("test"), tests.map(([, at, test]) => [at, test]), String(state.panel));
   fill($("cost"), data.costs.filter(({ field }) => has(field)).map(({ field, name }) => [field, name]), state.cost);
-  const keys = [...new Set(members.flatMap((number) => Object.keys(data.configurations[number].labels)))];
+  const keys = colourKeys();
   if (!keys.includes(state.colour)) state.colour = "strategy";
   fill($("colour"), keys.map((key) => [key, key]), state.colour);
   $("published-switch").hidden = !panel().published.length;
+  $("only-switch").hidden = solid().length === panel().members.length;
+  $("only").checked = only3d();
+  $("only").disabled = !solid().length;
+  settleAxis();
+}
+
+// Differences are shown where all are compared with one reference; published values are none.
+function settleAxis() {
+  const shown = [...(panel().reference === null || $("published").checked ? [] : [["difference", `difference to ${nameOf(panel().reference)}`]]), ["value", "value"]];
+  fill($("axis"), shown, shown.some(([key]) => key === state.axis) ? state.axis : "value");
 }
 
 function drawAll() {
@@ -40,7 +62,7 @@ function drawAll() {
 }
 
 // What is chosen stands in the address, so that a link shows the same.
-const REMEMBERED = ["panel", "metric", "cost", "colour"];
+const REMEMBERED = ["panel", "metric", "cost", "colour", "axis", "only"];
 
 function remember() {
   history.replaceState(null, "", `#${new URLSearchParams(REMEMBERED.map((name) => [name, state[name]]))}`);
@@ -56,15 +78,20 @@ function recall() {
 
 function change(changes) {
   Object.assign(state, changes);
-  if ("panel" in changes) {
-    state.chosen = null;
-    $("details").hidden = true;
+  state.focused = null;
+  hideTip();
+  if ("panel" in changes || "only" in changes) {
+    if ("panel" in changes || !members().includes(state.chosen)) {
+      state.chosen = null;
+      closeDetails();
+    }
     settle();
-    drawTable();
+    drawPicks();
     drawFailures();
-  } else if ("metric" in changes || "cost" in changes) table.rows().invalidate().draw(false);
+  }
+  if (["panel", "only", "metric", "cost"].some((name) => name in changes)) drawTable();
   drawCards();
-  drawPick();
+  drawAdvice();
   drawAll();
   remember();
 }
@@ -75,17 +102,20 @@ function connect() {
   $("cost").onchange = () => change({ cost: $("cost").value });
   $("colour").onchange = () => change({ colour: $("colour").value });
   $("intervals").onchange = drawAll;
+  $("axis").onchange = () => change({ axis: $("axis").value });
+  $("only").onchange = () => change({ only: $("only").checked ? "3d" : "all" });
   $("published").onchange = () => {
-    state.switched = true;
+    settleAxis();
     drawAll();
   };
   $("within").oninput = () => {
     const within = Number($("within").value);
     if ($("within").value === "" || !(within >= 0)) return;
     state.within[state.metric] = within;
-    drawPick();
+    drawAdvice();
   };
   $("csv").onclick = saveCsv;
+  connectKeys();
   wide.onchange = drawAll;
   window.onhashchange = () => change({ panel: recall() }); // which remember() does not cause
   // opening the details narrows the plot, which Plotly sees only of windows

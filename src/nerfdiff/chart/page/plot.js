@@ -1,74 +1,65 @@
-// The chart: points with their intervals, the frontier as a step line, published values.
-const LETTER = 7.5, MARK = 48; // pixels in the legend
-
-// Around the plot: room for the labels of published values on the right, and above for the lines of the legend.
-function marginFor(traces, published) {
-  const margin = { l: 62, r: !published.length ? 16 : WIDE() ? 150 : 104, b: 56 };
-  const names = traces.filter((trace) => trace.showlegend !== false).map((trace) => MARK + LETTER * trace.name.length);
-  const wide = names.reduce((a, b) => a + b, 0) / ($("plot").clientWidth - margin.l - margin.r);
-  return { ...margin, t: 16 + 22 * Math.ceil(1.1 * wide) };
-}
+// The chart: points with the intervals of their differences, the frontier as a step line, published values.
+let home = null; // the ranges of the axes before anyone zooms
 
 function shownPublished() {
   if (!$("published").checked) return [];
   return panel().published.filter((entry) => entry.metrics[state.metric] !== undefined);
 }
 
-// Whether published values leave our points room; switched on and off by hand, they stay so.
-function roomForPublished() {
-  const own = points().map((number) => mean(number, state.metric)), costs = points().map((number) => mean(number, state.cost));
-  const published = panel().published.filter((entry) => entry.metrics[state.metric] !== undefined);
-  const span = (found) => found.reduce((a, b) => Math.max(a, b), -Infinity) - found.reduce((a, b) => Math.min(a, b), Infinity);
-  const logs = (found) => found.filter((cost) => cost > 0).map(Math.log10);
-  const room = (ours, theirs) => span(ours) >= 0.2 * span([...ours, ...theirs]);
-  const timed = published.map((entry) => entry.costs[state.cost]).filter((cost) => cost !== undefined);
-  const fits = room(own, published.map((entry) => entry.metrics[state.metric])) && room(logs(costs), logs(timed));
-  return WIDE() && (fits || published.some((entry) => entry.same_size));
+// The points whose colour the legend does not hide.
+function shownPoints() {
+  const numbers = points(), { numeric, groups } = colouring(numbers);
+  const hidden = new Set(numeric ? [] : groups.filter(({ legend }) => isHidden(legend)).flatMap((group) => group.words));
+  return numbers.filter((number) => !hidden.has(colourValue(number)));
+}
+
+function axisOf(numbers) {
+  const published = shownPublished(), timed = published.filter((entry) => entry.costs[state.cost] !== undefined);
+  const costs = [...numbers.map((number) => mean(number, state.cost)), ...timed.map((entry) => entry.costs[state.cost])];
+  return costAxis(costs, published.length > timed.length ? 0.08 : 0);
 }
 
 function draw() {
-  if (!state.switched) $("published").checked = roomForPublished();
   const numbers = points(), published = shownPublished(), best = new Set(frontierOf(state.metric, state.cost));
+  drawLegend(numbers, colouring(numbers), published);
   if (!numbers.length) return drawNothing();
   const timed = published.filter((entry) => entry.costs[state.cost] !== undefined);
   const untimed = published.filter((entry) => entry.costs[state.cost] === undefined);
-  const costs = [...numbers.map((number) => mean(number, state.cost)), ...timed.map((entry) => entry.costs[state.cost])];
-  const bounds = (field) => (intervals() ? numbers.flatMap((number) => value(number, field)) : []);
-  const x = costAxis(costs, bounds(state.cost), untimed.length ? 0.08 : 0);
-  const ends = [...numbers.map((number) => mean(number, state.metric)), ...bounds(state.metric)];
+  const x = axisOf(numbers), kinds = colouring(numbers);
+  const ends = numbers.flatMap((number) => [height(number), ...reach(number).map((end) => height(number) + end)]);
   const yaxis = metricAxis([...ends, ...published.map((entry) => entry.metrics[state.metric])]);
-  const traces = [];
-  const { numeric, groups } = colouring(numbers);
-  const colours = new Map(groups.flatMap(({ words, colour }) => words.map((word) => [word, colour])));
-  for (const { colour, legend } of groups) if (legend !== null) traces.push(legendEntry(colour, legend));
-  // a trace per kind, which its legend hides; one of all numbers, which may be thousands
-  for (const [name, words] of numeric ? [["all", [...colours.keys()]]] : groups.map(({ legend, words }) => [legend, words])) {
-    const own = new Set(words), group = numbers.filter((number) => own.has(colourValue(number)));
-    traces.push(pointTrace(group.filter((number) => !best.has(number)), name, colours, x, true));
-    traces.push(pointTrace(group.filter((number) => best.has(number)), name, colours, x, false));
+  const colours = new Map(kinds.groups.flatMap(({ words, colour }) => words.map((word) => [word, colour])));
+  const shown = new Set(shownPoints()), traces = [];
+  // a trace per kind, whose bars have one colour; one of all numbers, which may be thousands
+  for (const words of kinds.numeric ? [[...colours.keys()]] : kinds.groups.map((group) => group.words)) {
+    const own = new Set(words), group = numbers.filter((number) => shown.has(number) && own.has(colourValue(number)));
+    traces.push(pointTrace(group.filter((number) => !best.has(number)), colours, x, true));
+    traces.push(pointTrace(group.filter((number) => best.has(number)), colours, x, false));
   }
-  traces.push(frontierTrace([...best], x), ring(x), ...publishedTraces(timed, untimed, x));
-  const margin = marginFor(traces, published), { clientWidth, clientHeight } = $("plot");
+  const marked = (number) => number !== null && shown.has(number);
+  traces.push(frontierTrace([...best], x), ring(state.chosen, marked(state.chosen), "chosen", x), ring(state.focused, marked(state.focused), "focused", x));
+  traces.push(...publishedTraces(timed, untimed, x));
+  const margin = { l: 62, r: !published.length ? 16 : WIDE() ? 150 : 104, b: 56, t: 14 }, { clientWidth, clientHeight } = $("plot");
   const size = [clientWidth - margin.l - margin.r, clientHeight - margin.t - margin.b];
   const layout = {
-    xaxis: x.axis, yaxis, margin, hovermode: "closest", dragmode: WIDE() ? "zoom" : false, showlegend: true,
-    legend: {
-      orientation: "h", y: 1.02, yanchor: "bottom", x: 0, uirevision: `${state.panel} ${state.colour}`,
-      itemclick: numeric ? false : "toggle", itemdoubleclick: numeric ? false : "toggleothers",
-    },
+    xaxis: x.axis, yaxis, margin, hovermode: "closest", dragmode: WIDE() ? "zoom" : false, showlegend: false,
     paper_bgcolor: "#fff", plot_bgcolor: "#fff",
     font: { family: "system-ui, sans-serif", size: WIDE() ? 13 : 11, color: "#1d2430" },
-    shapes: untimed.length ? [band(x)] : [],
-    annotations: publishedLabels(timed, untimed, x, yaxis.range, size), uirevision: `${state.panel} ${state.metric} ${state.cost}`,
+    shapes: [...(untimed.length ? [band(x)] : []), ...(canDiffer() ? [level()] : [])],
+    annotations: publishedLabels(timed, untimed, x, yaxis.range, size), uirevision: `${state.panel} ${state.metric} ${state.cost} ${byDifference()} ${state.only}`,
   };
-  const modeBarButtonsToRemove = ["select2d", "lasso2d", "autoScale2d"];
-  const config = { responsive: true, displaylogo: false, modeBarButtonsToRemove, displayModeBar: WIDE() ? "hover" : false };
-  Plotly.react($("plot"), traces.filter((trace) => trace.x.length || trace.name === "chosen"), layout, config);
+  home = { x: x.range, y: yaxis.range };
+  // what its buttons do, keys and pointers do; the picture lies beside this page
+  Plotly.react($("plot"), traces.filter((trace) => trace.x.length || trace.name === "chosen"), layout, { responsive: true, displaylogo: false, displayModeBar: false });
   $("plot-note").textContent = noteOn(numbers, published);
 }
 
 function noteOn(numbers, published) {
-  const all = panel().members.length, missing = all - numbers.length, notes = [];
+  const all = members().length, missing = all - numbers.length, notes = [];
+  const left = panel().members.filter((number) => !members().includes(number));
+  if (left.length) notes.push(`3D only leaves out what has views and no field: ${left.slice(0, 6).map(nameOf).join(", ")}${left.length > 6 ? ` and ${left.length - 6} more` : ""}.`);
+  if (!canDiffer()) notes.push(noReference());
+  else if (!many() && !numbers.some((number) => reach(number).length)) notes.push(`${metricOf(state.metric).name}: no values of enough scenes, so no interval says which differences are noise.`);
   const what = `${costOf(state.cost).name} or ${metricOf(state.metric).name}`;
   if (many()) notes.push(`Intervals of more than ${data.webgl_above} points are in the table only.`);
   const memory = costOf(state.cost).on_cpu;
@@ -89,69 +80,77 @@ function drawNothing() {
   $("plot-note").textContent = "";
 }
 
-function bars(numbers, field, colour, at = (number) => number) {
-  const found = numbers.map((number) => value(number, field));
-  const above = found.map((values) => (values.length > 1 ? values[2] - values[0] : 0));
-  // a bar down to zero has no end on a logarithmic axis: it ends at a hundredth
-  const below = found.map((values) => (values.length > 1 ? values[0] - at(values[1]) : 0));
-  return { type: "data", symmetric: false, array: above, arrayminus: below, color: colour, thickness: 1.2, width: 3, visible: intervals() };
+// Why there is nothing that all are compared with.
+function noReference() {
+  const found = new Set(members().map((number) => data.configurations[number].reference).filter((number) => number !== null));
+  return found.size > 1
+    ? "Several models are here: bars are of the difference to the reference of each one's own model, and the axis has values."
+    : "Nothing here is compared: there is no run of the reference with this metric.";
 }
 
-// Plotly takes the text of a legend for markup.
-const legendText = (name) => (name.length > 60 ? `${name.slice(0, 59)}…` : name).replaceAll("&", "&amp;").replaceAll("<", "&lt;");
-
-// Of its own, so that it is neither faint nor a ring.
-function legendEntry(colour, name) {
-  const marker = { color: colour, size: 10 }, uid = uidOf("legend", name);
-  return { type: "scatter", mode: "markers", name: legendText(name), uid, legendgroup: name, x: [null], y: [null], marker, hoverinfo: "skip", meta: "legend" };
+// How far the interval of the difference reaches below and above a point.
+function reach(number) {
+  const found = many() || !$("intervals").checked ? undefined : difference(number, state.metric);
+  return found?.length === 3 ? [found[1] - found[0], found[2] - found[0]] : [];
 }
 
-// What is hidden stays so by its uid, and no other group takes its place. Plotly wants one that can stand in a selector.
-const uidOf = (...parts) => [...[state.panel, state.colour, ...parts].join(" ")].map((letter) => letter.codePointAt(0)).join("-");
+function bars(numbers, colour) {
+  const found = numbers.map(reach);
+  return {
+    type: "data", symmetric: false, array: found.map((ends) => ends[1] ?? 0), arrayminus: found.map((ends) => -(ends[0] ?? 0)),
+    color: colour, thickness: 1.4, width: 4, visible: found.some((ends) => ends.length),
+  };
+}
+
 const many = () => points().length > data.webgl_above;
-const intervals = () => $("intervals").checked && !many();
 
-function pointTrace(numbers, name, colours, x, dominated) {
+function pointTrace(numbers, colours, x, dominated) {
   const own = numbers.map((number) => colours.get(colourValue(number)));
   const one = new Set(own).size === 1 ? own[0] : "#5c6675"; // bars of a trace have one colour
-  const meta = dominated ? "dominated" : "frontier", bar = dominated ? faint(one, 0.22) : one;
-  const symbol = numbers.map((number) => (data.configurations[number].failed ? "circle-open" : "circle"));
-  const gl = many() && webgl;
+  const adaptive = numbers.map((number) => data.configurations[number].adaptive);
+  const symbol = numbers.map((number) => `${shapeOf(number)}${data.configurations[number].failed ? "-open" : ""}`);
   return {
-    type: gl ? "scattergl" : "scatter", mode: "markers", name, uid: uidOf(meta, name), legendgroup: name, showlegend: false,
-    x: numbers.map((number) => x.at(mean(number, state.cost))), y: numbers.map((number) => mean(number, state.metric)),
-    customdata: numbers, hoverinfo: "none", meta,
-    marker: { color: dominated ? own.map((colour) => faint(colour, 0.3)) : own, size: dominated ? 8 : 11, symbol, line: { width: dominated ? 0 : 1.2, color: "#fff" } },
-    error_y: bars(numbers, state.metric, bar), error_x: bars(numbers, state.cost, bar, (low) => Math.max(low, 1e-12)),
+    type: many() && webgl ? "scattergl" : "scatter", mode: "markers", x: numbers.map((number) => x.at(mean(number, state.cost))), y: numbers.map(height),
+    customdata: numbers, hoverinfo: "none", meta: dominated ? "dominated" : "frontier",
+    marker: {
+      color: dominated ? own.map((colour) => faint(colour, 0.45)) : own, size: dominated ? 10 : 13, symbol,
+      line: { width: adaptive.map((is) => (is ? 2.5 : dominated ? 0 : 1)), color: adaptive.map((is) => (is ? "#1d2430" : "#fff")) },
+    },
+    error_y: bars(numbers, dominated ? faint(one, 0.35) : one),
   };
 }
 
 function frontierTrace(numbers, x) {
-  const at = numbers.map((number) => [x.at(mean(number, state.cost)), mean(number, state.metric)]);
+  const at = numbers.map((number) => [x.at(mean(number, state.cost)), height(number)]);
   if (at.length) at.push([x.edge, at.at(-1)[1]]);
   return {
-    type: "scatter", mode: "lines", name: "frontier", uid: "step", showlegend: true, x: at.map(([cost]) => cost), y: at.map(([, quality]) => quality),
+    type: "scatter", mode: "lines", x: at.map(([cost]) => cost), y: at.map(([, quality]) => quality),
     line: { shape: "hv", color: "#1d2430", width: 1.6 }, hoverinfo: "skip", meta: "step",
   };
 }
 
-function ring(x) {
-  const there = state.chosen !== null && both(state.chosen) && panel().members.includes(state.chosen);
+function ring(number, there, meta, x) {
   return {
-    type: "scatter", mode: "markers", name: "chosen", uid: "chosen", showlegend: false, hoverinfo: "skip", meta: "chosen",
-    x: there ? [x.at(mean(state.chosen, state.cost))] : [], y: there ? [mean(state.chosen, state.metric)] : [],
-    marker: { size: 19, color: "rgba(0,0,0,0)", line: { width: 2.5, color: "#1d2430" } },
+    type: "scatter", mode: "markers", name: meta, hoverinfo: "skip", meta,
+    x: there ? [x.at(mean(number, state.cost))] : [], y: there ? [height(number)] : [],
+    marker: { size: meta === "chosen" ? 22 : 26, color: "rgba(0,0,0,0)", line: { width: 2.5, color: meta === "chosen" ? "#1d2430" : "#0b62b8" } },
   };
 }
 
+// Where the reference is.
+function level() {
+  const at = byDifference() ? 0 : mean(panel().reference, state.metric);
+  return { type: "line", xref: "paper", x0: 0, x1: 1, yref: "y", y0: at, y1: at, line: { color: "#1d2430", width: 1, dash: "4px,4px" }, layer: "below" };
+}
+
 function publishedTraces(timed, untimed, x) {
-  const trace = (entries, place, meta, legend) => ({
-    type: "scatter", mode: "markers", name: "published", uid: uidOf(meta), legendgroup: "published", showlegend: legend && entries.length > 0, meta,
+  const trace = (entries, place, meta) => ({
+    type: "scatter", mode: "markers", meta,
     x: entries.map(place), y: entries.map((entry) => entry.metrics[state.metric]), customdata: entries.map((entry) => ({ published: entry })),
     hoverinfo: "none", cliponaxis: false, marker: { symbol: "diamond-open", size: 10, color: "#6b4a00", line: { width: 1.6 } },
   });
   const column = () => 10 ** (x.range[1] - ((1 - x.share) / 2) * (x.range[1] - x.range[0]));
-  return [trace(timed, (entry) => x.at(entry.costs[state.cost]), "published", true), trace(untimed, column, "published without a cost", !timed.length)];
+  return [trace(timed, (entry) => x.at(entry.costs[state.cost]), "published"), trace(untimed, column, "published without a cost")];
 }
 
 // Behind what has no place on the axis.

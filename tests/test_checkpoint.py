@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from model_fixtures import config
-from nerfdiff.checkpoint import load_model
+from nerfdiff.checkpoint import check_same_data, load_model
 from nerfdiff.exported_model import LoadedModel, export_model
 from nerfdiff.model import NerfDiff
 from nerfdiff.utils.errors import CheckpointError, ConfigError
@@ -73,3 +73,14 @@ def test_only_a_neighbour_that_has_equal_weights_is_shared(pair, tmp_path):
             value.add_(1)
     with pytest.raises(ConfigError, match="has none of the weights"):
         export_model(replace(made[0], model=other), tmp_path / "two", torch.float16, one.parent)
+
+
+def test_data_that_is_streamed_is_that_of_the_reader_it_was_made_from(monkeypatch):
+    """Shards keep the reader's name and digest, and need no data.root."""
+    began = {"root": "/a", "reader": "srn /a/cars_train", "files": "1"}
+    monkeypatch.setattr("nerfdiff.checkpoint.read_checkpoint", lambda path: {"SceneDataModule": began})
+    check_same_data(Path("last.ckpt"), began | {"root": "/elsewhere"})
+    check_same_data(Path("last.ckpt"), {"root": "/b", "reader": "srn /b/cars_train", "files": "1"})  # moved
+    for other in ({"files": "2"}, {"root": "/b", "reader": "srn /c/cars_train"}):
+        with pytest.raises(CheckpointError, match="was trained on"):
+            check_same_data(Path("last.ckpt"), began | other)

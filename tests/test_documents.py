@@ -13,7 +13,7 @@ from nerfdiff.utils.errors import ConfigError
 
 PROJECT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*PROJECT.glob("*.md"), *PROJECT.glob("docs/*.md"), *PROJECT.glob("assets/**/*.md")])
-FOLDERS = ("assets", "benchmarks", "conf", "docs", "notebooks", "src", "tests")
+FOLDERS = ("assets", "benchmarks", "conf", "docs", "notebooks", "scripts", "src", "tests")
 MADE = ("docs/speed_accuracy/chart",)
 """Paths that commands make."""
 OWN_CONFIG = "--config-dir"

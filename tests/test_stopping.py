@@ -13,9 +13,11 @@ import torch
 from lightning import Callback
 
 from nerfdiff.checkpoint import last_checkpoint as checkpoint_to_resume
-from nerfdiff.cli import entry_point
-from nerfdiff.stopping import SIGNALS, Stopped, on_signals
+from nerfdiff.checkpoint import load_model
+from nerfdiff.cli import entry_point, load_config
+from nerfdiff.stopping import SIGNALS, Stopped, in_a_job, on_signals
 from nerfdiff.training.module import NerfDiffModule
+from nerfdiff.training.run import build_trainer
 from nerfdiff.utils.errors import BusyError, CheckpointError, TrainingDiverged
 from nerfdiff.utils.files import held
 from training_fixtures import (
@@ -23,6 +25,7 @@ from training_fixtures import (
     command,
     environment,
     last_checkpoint,
+    overrides,
     run_training,
     train_with,
     write_dataset,
@@ -50,8 +53,8 @@ def run(begun, tmp_path):
 class Signal(Callback):
     """Sends this process a signal at the end of a training or validation batch, as a person or a scheduler would."""
 
-    def __init__(self, signum: int, batch: int | None = None, validation_batch: int | None = None, times: int = 1):
-        self.signum, self.batch, self.validation_batch, self.times = signum, batch, validation_batch, times
+    def __init__(self, *signums: int, batch: int | None = None, validation_batch: int | None = None):
+        self.signums, self.batch, self.validation_batch = signums, batch, validation_batch
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
         if batch_idx == self.batch:
@@ -62,24 +65,27 @@ class Signal(Callback):
             self.send()
 
     def send(self):
-        for _ in range(self.times):
-            os.kill(os.getpid(), self.signum)
+        for signum in self.signums:
+            os.kill(os.getpid(), signum)
 
 
 @pytest.mark.parametrize(
-    ("signum", "accumulate", "batch"),
-    [(signal.SIGTERM, 1, 0), (signal.SIGINT, 2, 4), (signal.SIGHUP, 2, 5)],
+    ("signums", "accumulate", "batch"),
+    [((signal.SIGTERM, signal.SIGUSR1), 1, 0), ((signal.SIGINT,), 2, 4), ((signal.SIGUSR2,), 2, 5)],
 )
 def test_a_stopped_run_ends_its_step_and_goes_on_as_if_nothing_happened(
-    data, tmp_path, monkeypatch, signum, accumulate, batch
+    data, tmp_path, monkeypatch, signums, accumulate, batch
 ):
-    """Stopped in the first step, and of windows of two batches within one (batch 4) and at its end (batch 5)."""
+    """Stopped in the first step, and of windows of two batches within one (batch 4) and at its end (batch 5).
+
+    Slurm sends SIGTERM and what it was asked for at once, and the latter counts.
+    """
     more = [f"trainer.accumulate_grad_batches={accumulate}", "callbacks.last.every_n_steps=1000"]
     run_training(data, tmp_path / "whole", *more)
     with pytest.raises(Stopped) as stopped:
-        train_with(monkeypatch, Signal(signum, batch), data, tmp_path / "stopped", *more)
+        train_with(monkeypatch, Signal(*signums, batch=batch), data, tmp_path / "stopped", *more)
     step = -(-(batch + 1) // accumulate)
-    assert stopped.value.status == 128 + signum
+    assert stopped.value.status == 128 + signums[-1]
     assert last_checkpoint(tmp_path / "stopped")["global_step"] == step
     assert f"Step {step} is saved in {tmp_path / 'stopped' / 'checkpoints' / 'last.ckpt'}" in str(stopped.value)
     run_training(data, tmp_path / "stopped", *more)
@@ -101,7 +107,9 @@ def test_a_run_stopped_in_a_validation_validates_anew(data, tmp_path, monkeypatc
 
 def test_a_second_signal_ends_the_run_at_once(data, run, monkeypatch):
     with pytest.raises(Stopped, match="Step 2 is saved"):
-        train_with(monkeypatch, Signal(signal.SIGINT, 4, times=2), data, run, "callbacks.last.every_n_steps=1000")
+        train_with(
+            monkeypatch, Signal(signal.SIGINT, signal.SIGINT, batch=4), data, run, "callbacks.last.every_n_steps=1000"
+        )
     assert last_checkpoint(run)["global_step"] == 2
 
 
@@ -276,7 +284,7 @@ def test_a_run_whose_losses_jump_saves_nothing_until_they_calm_down(data, run, m
     """Far before anything is not finite; and no step that is stopped then replaces a good one."""
     diverge(monkeypatch, at=3, factor=1e6)
     with pytest.raises(Stopped, match="Step 3 is saved"):
-        train_with(monkeypatch, Signal(signal.SIGTERM, 7), data, run, *EVERY_STEP, "trainer.max_steps=20")
+        train_with(monkeypatch, Signal(signal.SIGTERM, batch=7), data, run, *EVERY_STEP, "trainer.max_steps=20")
     assert last_checkpoint(run)["global_step"] == 3
 
 
@@ -293,6 +301,100 @@ def test_a_checkpoint_that_cannot_be_read_is_passed_over(data, run, caplog):
 def test_a_checkpoint_that_is_missing_is_passed_over(run):
     (run / "checkpoints" / "last.ckpt").unlink()
     assert checkpoint_to_resume(run).name == "previous.ckpt"
+
+
+def test_a_last_checkpoint_of_another_version_is_taken_where_it_is_the_newer(data, run, tmp_path):
+    """As Lightning leaves it where it is not to replace a file; a damaged one is passed over."""
+    folder = run / "checkpoints"
+    shutil.copy(folder / "last.ckpt", folder / "last-v1.ckpt")
+    shutil.copy(folder / "previous.ckpt", folder / "last.ckpt")  # of step 1
+    os.utime(folder / "last-v1.ckpt", (0, 0))  # times are copied, or not
+    assert checkpoint_to_resume(run).name == "last-v1.ckpt"
+    assert load_model(run, "ema").path.name == "last-v1.ckpt"
+    (folder / "last-v2.ckpt").write_bytes(b"torn")
+    run_training(data, run, "trainer.max_steps=3", "callbacks.last.every_n_steps=1", "optimizer.decay=none")
+    assert checkpoint_to_resume(run).name == "last.ckpt" and last_checkpoint(run)["global_step"] == 3
+    (folder / "last.ckpt").unlink()
+    (folder / "previous.ckpt").unlink()
+    assert checkpoint_to_resume(run).name == "last-v1.ckpt"
+
+
+@pytest.fixture
+def scontrol(tmp_path, monkeypatch):
+    """A fake of Slurm's command; what it was asked."""
+    (tmp_path / "bin").mkdir()
+    command, told = tmp_path / "bin" / "scontrol", tmp_path / "told"
+    command.write_text(
+        f'#!/bin/sh\necho "$@" >> {told}\n[ $1 = requeue ] || echo "JobId=7 PreemptTime=$PREEMPT_TIME"\n'
+    )
+    command.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{command.parent}:{os.environ['PATH']}")
+    return lambda: told.read_text().splitlines() if told.exists() else []
+
+
+@pytest.mark.parametrize(
+    ("signum", "environ", "asked"),
+    [
+        (signal.SIGUSR1, {"SLURM_JOB_ID": "7"}, ["requeue 7"]),
+        (
+            signal.SIGUSR1,
+            {"SLURM_JOB_ID": "9", "SLURM_ARRAY_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": "3"},
+            ["requeue 7_3"],
+        ),
+        (signal.SIGTERM, {"SLURM_JOB_ID": "7", "PREEMPT_TIME": "2026-11-28T10:00:00"}, ["show job 7", "requeue 7"]),
+        (signal.SIGTERM, {"SLURM_JOB_ID": "7", "PREEMPT_TIME": "None"}, ["show job 7"]),  # scancel
+        (signal.SIGINT, {"SLURM_JOB_ID": "7"}, []),
+        (signal.SIGUSR1, {}, []),
+    ],
+)
+@pytest.mark.parametrize("rank", [0, 1])
+def test_a_job_that_is_to_give_way_is_queued_again_once(signum, environ, asked, rank, scontrol, monkeypatch):
+    for name, value in environ.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr("nerfdiff.utils.rank._known", [rank])
+    with pytest.raises(Stopped), in_a_job():
+        raise Stopped(signum)
+    assert [words for words in scontrol() if rank == 0 or "requeue" in words] == (asked if rank == 0 else [])
+
+
+def test_submitits_jobs_are_queued_again_by_submitit_alone(scontrol, monkeypatch):
+    """Whose handler ends the process; SIGTERM alone, which it lets pass by, stops the work too."""
+    for name, value in {"SUBMITIT_EXECUTOR": "slurm", "SLURM_JOB_ID": "7", "PREEMPT_TIME": "None"}.items():
+        monkeypatch.setenv(name, value)
+    called = []
+
+    def requeue(signum, frame):
+        called.append(signum)
+        sys.exit(-1)
+
+    def job(signum):
+        with in_a_job():
+            os.kill(os.getpid(), signum)
+            time.sleep(1)
+
+    before = [signal.signal(signal.SIGUSR2, requeue), signal.signal(signal.SIGTERM, signal.SIG_IGN)]
+    try:
+        signal.signal(signal.SIGTERM, lambda *_: called.append("passed by"))
+        with pytest.raises(SystemExit):
+            job(signal.SIGUSR2)
+        with pytest.raises(Stopped):
+            job(signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGUSR2, before[0])
+        signal.signal(signal.SIGTERM, before[1])
+    assert called == [signal.SIGUSR2] and scontrol() == ["show job 7"]
+
+
+def test_under_slurm_lightning_queues_nothing_and_takes_no_strangers_checkpoint(data, run, monkeypatch):
+    """A checkpoint that Lightning writes on a scheduler's signal is of whatever run the folder's last job was."""
+    for name, value in {"NTASKS": "1", "PROCID": "0", "LOCALID": "0", "NODEID": "0", "JOB_ID": "7"}.items():
+        monkeypatch.setenv(f"SLURM_{name}", value)
+    monkeypatch.setenv("SLURM_JOB_NAME", "train")
+    cfg = load_config("train", overrides(data, run, f"paths.output_dir={run}"))
+    trainer = build_trainer(cfg)
+    environment = trainer._accelerator_connector.cluster_environment
+    assert type(environment).__name__ == "SLURMEnvironment" and not environment.auto_requeue
+    assert trainer.default_root_dir == str(run)
 
 
 def test_two_commands_do_not_write_one_run(data, run):

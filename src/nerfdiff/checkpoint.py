@@ -17,7 +17,7 @@ import torch
 from nerfdiff.averages import average_of
 from nerfdiff.exported_model import DTYPES, LoadedModel, Read, are_phases, export_model, is_size, read_export
 from nerfdiff.field.kinds import TRIPLANE
-from nerfdiff.inputs import LAST, PREVIOUS, find_weights
+from nerfdiff.inputs import LAST, PREVIOUS, checkpoints, find_weights
 from nerfdiff.model import NerfDiff, build_on_meta
 from nerfdiff.utils.errors import CheckpointError, ConfigError
 
@@ -45,7 +45,7 @@ def load_model(
     if weights not in ("ema", "raw"):
         raise CheckpointError(f"weights must be ema or raw, got {weights!r}")
     path = find_weights(ckpt, assets)
-    if Path(ckpt).is_dir() and path.name in (LAST, PREVIOUS):
+    if path in checkpoints(ckpt):
         path = last_checkpoint(ckpt)  # the last one that can be read
     read = read_export if path.suffix == ".safetensors" else _read_ckpt
     config, state, about = read(path, weights)
@@ -252,14 +252,19 @@ def _build(config: Mapping, renderer: Mapping, state: dict[str, torch.Tensor], p
 def last_checkpoint(run: str | Path) -> Path:
     """The checkpoint that a run resumes from: the last one that can be read; a line says if there is a later one.
 
+    Beside `last-v1.ckpt`, which Lightning writes where it is not to replace a file, `last.ckpt` may be an old one: then
+    the one of most steps is taken.
+
     Returns:
         its path, or where the first will be.
 
     Raises:
         CheckpointError: there are checkpoints, but none that can be read.
     """
-    folder = Path(run) / "checkpoints"
-    found = [path for path in (folder / LAST, folder / PREVIOUS) if path.is_file()]
+    found = [path for path in checkpoints(run) if path.is_file()]
+    if any(path.name not in (LAST, PREVIOUS) for path in found):
+        found.sort(key=lambda path: steps_of(path) or 0, reverse=True)
+        log.info("of %s the one of most steps is taken", ", ".join(path.name for path in found))
     for number, path in enumerate(found):
         if number + 1 == len(found):
             read_checkpoint(path)
@@ -269,7 +274,15 @@ def last_checkpoint(run: str | Path) -> Path:
             return path
         except CheckpointError as error:
             log.warning("%s; the one before it is taken, %s", error, found[number + 1])
-    return folder / LAST
+    return checkpoints(run)[0]
+
+
+def steps_of(path: Path) -> int | None:
+    """Return a checkpoint's steps; None where it cannot be read."""
+    try:
+        return _read(path)["global_step"]
+    except CheckpointError:
+        return None
 
 
 def describe(path: Path) -> str:
@@ -292,7 +305,7 @@ def check_finite(path: Path) -> None:
 
 
 def check_same_data(path: Path, now: Mapping[str, str]) -> None:
-    """Refuse to go on with other data than a run began with; files that were only moved are the same.
+    """Refuse to go on with other data than a run began with; files that were only moved, or are streamed, are the same.
 
     Args:
         now: what `SceneDataModule.state_dict` says of the data.
@@ -307,8 +320,9 @@ def check_same_data(path: Path, now: Mapping[str, str]) -> None:
     if before == now:
         return
     moved = before["reader"].replace(before["root"], now["root"])
-    if before["files"] == now["files"] and moved == now["reader"]:
-        log.info("the data moved from %s to %s", before["root"], now["root"])
+    if before["files"] == now["files"] and now["reader"] in (moved, before["reader"]):
+        if now["reader"] == moved:
+            log.info("the data moved from %s to %s", before["root"], now["root"])
         return
     if before["root"] != now["root"]:
         what = f"data.root={before['root']}, and data.root is {now['root']} now"

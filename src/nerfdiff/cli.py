@@ -27,7 +27,7 @@ from nerfdiff.inputs import CHECKOUT, CONF, check_inputs, check_output
 from nerfdiff.limits import check_limit, check_limits
 from nerfdiff.noise import quieten
 from nerfdiff.quoting import gather_lists, parse_override, quote_values
-from nerfdiff.stopping import Stopped, leave, on_signals, stop
+from nerfdiff.stopping import Stopped, in_a_job, leave, on_signals, stop
 from nerfdiff.utils.errors import ConfigError, UserError, is_out_of_memory
 from nerfdiff.utils.hashes import sha256_values
 from nerfdiff.utils.memory import keep_freed_memory
@@ -78,7 +78,8 @@ def entry_point(config_name: str, *inputs: str) -> Callable[[Callable[[DictConfi
         def run(cfg: DictConfig) -> object:
             quieten()
             try:
-                return function(cfg)
+                with in_a_job():
+                    return function(cfg)
             except Exception as error:
                 message = explain(error, cfg)
                 if message is None or os.environ.get("HYDRA_FULL_ERROR") == "1":
@@ -140,6 +141,7 @@ OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
 # of the commands' help
 OmegaConf.register_new_resolver("command", lambda name: " ".join(command_words(name)), replace=True)
 OmegaConf.register_new_resolver("groups", group_lines, replace=True)
+OmegaConf.register_new_resolver("all_shards", lambda of: ",".join(f"{n}/{of}" for n in range(1, of + 1)), replace=True)
 
 
 def explain(error: BaseException, cfg: DictConfig | None = None) -> str | None:

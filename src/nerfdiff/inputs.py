@@ -20,8 +20,9 @@ LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
 
 
 def checkpoints(run: str | Path) -> list[Path]:
-    """List a run's checkpoint to resume from, and the one before it."""
-    return [Path(run) / "checkpoints" / name for name in (LAST, PREVIOUS)]
+    """List a run's checkpoint to resume from, the one before it, and what there is beside them, as last-v1.ckpt."""
+    folder = Path(run) / "checkpoints"
+    return [*(folder / name for name in (LAST, PREVIOUS)), *sorted(folder.glob(f"{Path(LAST).stem}-v*.ckpt"))]
 
 
 def find_weights(ckpt: str | Path, assets: str | Path | None, key: str = "ckpt") -> Path:
@@ -54,8 +55,8 @@ def check_inputs(
     """Refuse a composed config whose checkpoint, picture, dataset or results are not there.
 
     Args:
-        keys: what the command reads, among `ckpt`, `init`, `image`, `images`, `picture.mask`, `fields`, `data.root` and
-            `results`. With an `image` no dataset is read.
+        keys: what the command reads, among `ckpt`, `init`, `image`, `images`, `picture.mask`, `fields`, `data.root`,
+            `shards` and `results`. With an `image` no dataset is read.
         swept: keys that every job of a sweep sets for itself, which are the jobs' to check.
         only: keys whose files are looked for; None is all.
 
@@ -68,8 +69,11 @@ def check_inputs(
             continue
         if key in ("ckpt", "init"):
             find_weights(value, cfg.paths.assets_dir, key)
-        elif key == "data.root":
+        elif key == "shards":
             if not Path(value).is_dir():
+                raise DataError(f"shards={value}: no such folder; name the one in which the shards were made")
+        elif key == "data.root":
+            if not OmegaConf.select(cfg, "data.shards") and not Path(value).is_dir():
                 raise DataError(f"data.root={value}: no such folder; set data.root to the folder of the dataset")
         elif key == "results":
             for place in [value] if isinstance(value, str) else value:

@@ -30,6 +30,8 @@ LIMITS: dict[str, tuple[float, float, str]] = {
     "optimizer.betas": BELOW_1,
     "optimizer.warmup_steps": AT_LEAST_0,
     "losses.lambda_*": AT_LEAST_0,
+    "callbacks.heartbeat.every": ABOVE_0,
+    "callbacks.heartbeat.patience": ABOVE_0,
     "callbacks.ema.decay": SHARE,
     "callbacks.ema.warmup": AT_LEAST_0,
     "callbacks.last.every_n_steps": AT_LEAST_1,

@@ -8,6 +8,7 @@ import time
 from subprocess import Popen
 
 import torch
+from lightning.fabric.plugins.environments import TorchElasticEnvironment
 from lightning.fabric.strategies.launchers import subprocess_script
 
 GRACE = 10.0
@@ -25,8 +26,8 @@ def watch() -> None:
 
 
 def is_launched() -> bool:
-    """Return true if this process was launched to help another."""
-    return int(os.environ.get("LOCAL_RANK", 0)) > 0
+    """Return true if another process of the run launched this one, which then speaks for it: torchrun does not."""
+    return int(os.environ.get("LOCAL_RANK", 0)) > 0 and not TorchElasticEnvironment.detect()
 
 
 def end_launched(signum: int) -> None:
@@ -43,14 +44,18 @@ def lost_process(error: RuntimeError) -> str | None:
     network = isinstance(error, torch.distributed.DistError) or "gloo" in str(error).lower()
     if not network:
         return None
+    if "EADDRINUSE" in str(error):
+        port = os.environ.get("MASTER_PORT", "unknown")
+        return f"The port at which the processes of this run meet is in use: set MASTER_PORT to another than {port}."
     time.sleep(0.2)  # it is heard of before the system knows how it ended
     if is_launched() and os.getppid() == _PARENT:
         sys.exit(1)  # the first process will say it
-    return _sentence()
+    return gone()
 
 
-def _sentence() -> str:
-    if is_launched():
+def gone() -> str:
+    """A sentence on the process that is gone, as far as this one knows of it."""
+    if is_launched() and os.getppid() != _PARENT:
         return "The first process of this run ended."
     for rank, process in enumerate(_launched, 1):
         if code := process.poll():
@@ -72,7 +77,7 @@ class _Observer(subprocess_script._ChildProcessObserver):
             return all(code == 0 for code in codes)
         if torch.distributed.is_initialized() and torch.distributed.get_backend() != "gloo":
             time.sleep(GRACE)
-            print(f"error: {_sentence()} The same command goes on from the last checkpoint.", file=sys.stderr)
+            print(f"error: {gone()} The same command goes on from the last checkpoint.", file=sys.stderr)
             for process in self._child_processes:
                 process.kill()
             os._exit(1)
@@ -83,5 +88,5 @@ def _end_with_parent() -> None:
     while os.getppid() == _PARENT:
         time.sleep(1)
     time.sleep(GRACE)
-    print(f"error: {_sentence()} The same command goes on.", file=sys.stderr)
+    print(f"error: {gone()} The same command goes on.", file=sys.stderr)
     os._exit(1)

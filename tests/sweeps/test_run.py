@@ -81,6 +81,17 @@ def test_every_configuration_is_run_once_with_all_seeds(tmp_path):
     assert len(read_plan(tmp_path)) == len(read_rows(tmp_path / "results.jsonl")) == 2 * N
 
 
+def test_of_jobs_that_differ_in_numbers_one_is_composed_before_they_begin(tmp_path):
+    words = ("strategy=ngd", "strategy=none", *(f"x={n}/40" for n in range(1, 41)))
+    axes = Axis("strategy", words[:2]), Axis("x", words[2:])
+    composed = []
+    run = sweep(Here(tmp_path), batch_size=None, space=Space((axes,), (), ("seed=0",)))
+    run.load = lambda config, words: composed.append(words) or config
+    run()
+    assert sorted(words[0] for words in composed) == ["strategy=ngd", "strategy=none"]
+    assert len(read_rows(tmp_path / "results.jsonl")) == 80
+
+
 def test_a_sweep_that_was_killed_goes_on_with_what_is_left(tmp_path):
     def dies(words):
         if words[0] == "x=2":

@@ -16,7 +16,7 @@ from nerfdiff.sweeps.jobs import group, jobs_of
 from nerfdiff.utils.errors import ConfigError
 from training_fixtures import SRC, environment, run_training, write_dataset
 
-OURS = ("speed_accuracy", "stability")
+OURS = ("shards", "speed_accuracy", "stability")
 SWEEPS = sorted(path.stem for path in (CONF / "sweep").glob("*.yaml") if path.stem not in OURS)
 """Of Hydra's own sweeper; ours is tested beside this file."""
 

@@ -15,9 +15,11 @@ from nerfdiff.data.batch import ViewBatch
 from nerfdiff.data.cache import CachedReader
 from nerfdiff.data.draws import Draws, DrawSampler
 from nerfdiff.data.scene import MissingSplit, SceneReader
+from nerfdiff.data.streamed import StreamedReader
 from nerfdiff.data.views import EvaluationScenes, TrainingViews
 from nerfdiff.stopping import ignore_signals
 from nerfdiff.utils.errors import ConfigError
+from nerfdiff.utils.shard import Shard
 from nerfdiff.utils.spread import spread
 
 log = logging.getLogger(__name__)
@@ -53,6 +55,7 @@ class SceneDataModule(LightningDataModule):
         num_workers: processes that load training and test batches.
         cache, cache_dir: whether training images are decoded once into one file, and where.
         seed: of the draws.
+        shards: folder or URL of `make_shards`, from which all splits are streamed instead of read from `root` (None).
         about: words on the data for whoever uses a model trained on it, as the elevations its cameras have.
         train_split, val_split, test_split: names of the dataset's splits. Where the one for validation is
             not there, training goes on without validation.
@@ -86,6 +89,7 @@ class SceneDataModule(LightningDataModule):
         cache_dir: str | Path,
         seed: int,
         about: str,
+        shards: str | None = None,
         train_split: str = "train",
         val_split: str = "val",
         test_split: str = "test",
@@ -114,6 +118,8 @@ class SceneDataModule(LightningDataModule):
         if not 0 <= seed < 2**64:
             raise ConfigError(f"data.seed={seed} must be from 0 to 2^64 - 1")
         self.name, self.make_reader = name, reader
+        if shards is not None:
+            self.make_reader = lambda root, split, image_size: StreamedReader(shards, split, image_size)
         self.root, self.image_size, self.background = root, image_size, background
         self.train_scenes, self.train_source_view = train_scenes, train_source_view
         self.train_source_views = train_source_views
@@ -122,12 +128,13 @@ class SceneDataModule(LightningDataModule):
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
         self.val_source_view, self.val_scenes, self.val_targets = val_source_view, val_scenes, val_targets
         self.source_view, self.eval_scenes, self.eval_stride = source_view, eval_scenes, eval_stride
-        self.cache, self.cache_dir = cache, cache_dir
+        self.cache, self.cache_dir = cache and shards is None, cache_dir
         self.about = about
         self.splits = {"train": train_split, "val": val_split, "test": test_split}
         self.train_reader: SceneReader | None = None
         self.val_set: EvaluationScenes | None = None
         self.test_set: EvaluationScenes | None = None
+        self.shard: Shard | None = None  # of the test scenes; None: all
 
     @cached_property
     def _trained_on(self) -> dict[str, str]:
@@ -170,7 +177,11 @@ class SceneDataModule(LightningDataModule):
             self.val_set = self._validation_scenes()
         else:
             self.test_set = EvaluationScenes(
-                self.reader("test"), self.source_view, scenes=self.eval_scenes, stride=self.eval_stride
+                self.reader("test"),
+                self.source_view,
+                scenes=self.eval_scenes,
+                stride=self.eval_stride,
+                shard=self.shard,
             )
 
     def train_dataloader(self) -> DataLoader:

@@ -9,6 +9,7 @@ from nerfdiff.data.batch import Sample
 from nerfdiff.data.draws import Draws
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.utils.errors import DataError, some
+from nerfdiff.utils.shard import Shard
 from nerfdiff.utils.spread import spread
 
 log = logging.getLogger(__name__)
@@ -55,6 +56,7 @@ class EvaluationScenes(Dataset[Sample]):
         scenes: how many scenes, spread evenly over the split (all where None or more than there are).
         targets: how many targets per scene, spread evenly over the other views (all where None).
         stride: of the other views, take every `stride`-th.
+        shard: of these scenes; None: all of them.
 
     Raises:
         DataError: a scene has no such source view, or its files are damaged.
@@ -67,9 +69,12 @@ class EvaluationScenes(Dataset[Sample]):
         scenes: int | None = None,
         targets: int | None = None,
         stride: int = 1,
+        shard: Shard | None = None,
     ):
         self.reader = reader
         self.indices = spread(len(reader), scenes)
+        if shard is not None:
+            self.indices = shard.share(self.indices)
         # looked up now, so that a long run does not fail at its first validation
         self.sources = [position_of(reader, index, source_view) for index in self.indices]
         self.targets, self.stride = targets, stride

@@ -2,10 +2,9 @@
 
 import logging
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from statistics import fmean, median
 from typing import Any
 
+import pandas as pd
 import torch
 
 from nerfdiff.distill.strategy import Strategy
@@ -19,6 +18,8 @@ from nerfdiff.utils.timing import cost_of_a_piece, summarise
 
 log = logging.getLogger(__name__)
 
+TOLD = 100  # reasons of the judge in a row
+SPENT = ("denoiser_calls", "field_queries", "steps", "steps_planned", "stopped_by")
 PARTS = ("denoise", "fit", "guide")
 STABILITY = ("nonfinite_grad_steps", "loss_spikes", "grad_norm_p99")
 
@@ -28,54 +29,74 @@ def cost_fields(run: EvaluationRun, strategy: Strategy) -> dict[str, Any]:
 
     A baseline, which runs no model, has counts alone.
     """
-    scenes = costs(run, strategy)
-    fields: dict[str, Any] = _verdict(scenes) | {
-        "denoiser_calls": sum(int(cost["denoiser_calls"]) for cost in scenes),
-        "field_queries": sum(int(cost["field_queries"]) for cost in scenes),
-    }
+    scenes = scene_costs(run, strategy)
+    fields = cost_totals(scenes, run.cost_key)
+    if fields["field_queries"] == 0:
+        return fields
+    timing_s = cost_of_a_piece(run.device) * float(scenes["pieces"].mean())
+    return fields | model_fields(run) | {"backend": _backend(run), "timing_s": timing_s}
+
+
+def scene_costs(run: EvaluationRun, strategy: Strategy) -> pd.DataFrame:
+    """Return a line for each scene: its costs, status and verdict."""
+    return pd.DataFrame(costs(run, strategy))
+
+
+def cost_totals(scenes: pd.DataFrame, conditions: str) -> dict[str, Any]:
+    """Return those cost fields of a row that follow from `scene_costs`.
+
+    Args:
+        conditions: under which seconds and memory count, see `EvaluationRun.cost_key`.
+    """
+    fields: dict[str, Any] = _verdict(scenes["verdict"])
+    fields |= {name: int(scenes[name].sum()) for name in ("denoiser_calls", "field_queries")}
     if fields["field_queries"] == 0:
         return fields
     # a run that went on elsewhere, or with other threads, has numbers of all its scenes, and seconds of these
-    alike = [cost for cost in scenes if cost["conditions"] == run.cost_key]
+    alike = scenes[scenes["conditions"] == conditions]
     fields["scene_s"] = _timing(alike, "seconds")
     fields |= {f"{name}_s": _timing(alike, name) for name in ("encode", "render")}
     fields |= _spent(scenes)
     if fields["denoiser_calls"]:
         fields |= {f"{name}_s": _timing(alike, name) for name in ("distill", *PARTS)}
-    fields["timing_s"] = cost_of_a_piece(run.device) * fmean(cost["pieces"] for cost in scenes)
-    fields |= model_fields(run) | {"backend": _backend(run)}
-    fields["peak_mem_bytes"] = max((cost["peak_mem_bytes"] for cost in alike), default=None)
-    kept = [cost["field_bytes"] for cost in scenes]
-    fields["field_bytes"] = None if None in kept else sum(kept)
+    fields["peak_mem_bytes"] = int(alike["peak_mem_bytes"].max()) if len(alike) else None
+    if "field_bytes" in scenes and scenes["field_bytes"].notna().all():
+        fields["field_bytes"] = int(scenes["field_bytes"].sum())
     # of the views that were fitted, not of those asked for; a run may go on from one that did not write them down
-    virtual = {cost["virtual_views"] for cost in scenes if cost.get("virtual_views") is not None}
-    if len(virtual) > 1:
-        log.warning("scenes had %d to %d virtual views; the row's K is the most", min(virtual), max(virtual))
-    fields["K"] = max(virtual, default=None)
-    fallen = Counter(cost["status"] for cost in scenes if cost["status"] != "ok")
+    virtual = scenes["virtual_views"].dropna() if "virtual_views" in scenes else ()
+    if len(virtual) and virtual.min() < virtual.max():
+        log.warning("scenes had %d to %d virtual views; the row's K is the most", virtual.min(), virtual.max())
+    fields["K"] = int(virtual.max()) if len(virtual) else None
+    fallen = Counter(status for status in scenes["status"] if status != "ok")
     if fallen:
         fields["error"] = "fell back: " + ", ".join(f"{count} scenes {status}" for status, count in fallen.items())
     return fields | {"fallbacks": fallen.total()}
 
 
-def _spent(scenes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _spent(scenes: pd.DataFrame) -> dict[str, Any]:
     """Return medians of what scenes took, and why they ended; a run may go on from one that did not write it down."""
-    fields: dict[str, Any] = {}
-    for name in ("denoiser_calls", "field_queries", "steps"):
-        if counts := [cost[name] for cost in scenes if cost.get(name) is not None]:
-            fields[f"{name}_median"] = float(median(counts))
-    fields["steps_planned"] = max((cost["steps_planned"] for cost in scenes if cost.get("steps_planned")), default=None)
-    reasons = Counter(cost["stopped_by"] for cost in scenes if cost.get("stopped_by"))
+    known = {name: scenes[name].dropna() for name in SPENT if name in scenes}
+    fields: dict[str, Any] = {
+        f"{name}_median": float(known[name].median())
+        for name in ("denoiser_calls", "field_queries", "steps")
+        if len(known.get(name, ()))
+    }
+    planned = known.get("steps_planned", ())
+    fields["steps_planned"] = int(planned.max()) if len(planned) else None
+    reasons = Counter(known.get("stopped_by", ()))
     return fields | {"stopped_by": ", ".join(f"{why} {count}" for why, count in reasons.most_common()) or None}
 
 
-def _verdict(scenes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _verdict(said: pd.Series) -> dict[str, Any]:
     """Count the scenes that the judge suspects, and say why; nothing where it did not look at all of them."""
-    said = [scene["verdict"] for scene in scenes]
-    if None in said:
+    if said.isna().any():
         return {}
-    suspect = Counter(why for verdict in said if verdict != OK for why in (verdict.removeprefix("suspect: "),))
-    told = "; ".join(f"{count} of {len(said)} {why}" for why, count in suspect.items())
+    suspect = Counter(verdict.removeprefix("suspect: ") for verdict in said if verdict != OK)
+    commonest = sorted(suspect.items(), key=lambda item: (-item[1], item[0]))
+    words = [f"{count} of {len(said)} {why}" for why, count in commonest[:TOLD]]
+    if rest := sum(count for _, count in commonest[TOLD:]):
+        words.append(f"{rest} more")  # a row has room for so many: see per_scene.csv
+    told = "; ".join(words)
     return {"suspects": suspect.total(), "verdict": f"suspect: {told}" if told else OK}
 
 
@@ -92,11 +113,13 @@ def model_fields(run: EvaluationRun) -> dict[str, Any]:
     } | {name: run.stability.get(name) for name in STABILITY}
 
 
-def _timing(scenes: list[dict[str, Any]], name: str) -> Timing | None:
+def _timing(scenes: pd.DataFrame, name: str) -> Timing | None:
     """Summarise a time over the scenes after each process's first, which warms it up; over all if there is no other."""
-    measured = [cost for cost in scenes if name in cost]
-    warm = [cost[name] for cost in measured if cost.get("warm")]
-    return summarise(warm or [cost[name] for cost in measured])
+    if name not in scenes:
+        return None
+    measured = scenes[scenes[name].notna()]
+    warm = measured[measured["warm"] == True] if "warm" in measured else measured[:0]  # noqa: E712  (None is none)
+    return summarise((warm if len(warm) else measured)[name].tolist())
 
 
 @torch.no_grad()

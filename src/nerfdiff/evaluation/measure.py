@@ -4,8 +4,10 @@ import json
 import logging
 import os
 import shlex
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 import filelock
@@ -15,7 +17,7 @@ from omegaconf import DictConfig
 from nerfdiff.cli import SEARCHPATH, command_words
 from nerfdiff.data.scene import SceneReader
 from nerfdiff.distill.strategy import Strategy
-from nerfdiff.evaluation.costs import cost_fields, model_fields
+from nerfdiff.evaluation.costs import cost_fields, model_fields, scene_costs
 from nerfdiff.evaluation.dashboard import show_in_dashboard
 from nerfdiff.evaluation.run import EvaluationRun, RunSettings, choose_device
 from nerfdiff.metrics.predictions import NonFinitePrediction
@@ -23,9 +25,12 @@ from nerfdiff.metrics.score import Scorer, truth_from
 from nerfdiff.results.environment import environment
 from nerfdiff.results.row import ResultRow, append_row
 from nerfdiff.utils.errors import ConfigError, TimeUp, is_out_of_memory
+from nerfdiff.utils.files import atomic, encode, write_text
 from nerfdiff.utils.hashes import sha256_values
 
 log = logging.getLogger(__name__)
+
+COSTS, SHARD = "costs.csv", "shard.json"
 
 
 def measure(run: EvaluationRun, strategy: Strategy, scorer: Scorer, reader: SceneReader) -> ResultRow:
@@ -34,12 +39,15 @@ def measure(run: EvaluationRun, strategy: Strategy, scorer: Scorer, reader: Scen
     Of several processes that made the scenes side by side, the first appends the row.
     """
     scores = run.folder / "scores" / strategy.name
-    summary = scorer.score(run.predictions / strategy.name, truth_from(reader), scores, run.device)
+    shard = run.settings.shard
+    summary = scorer.score(run.predictions / strategy.name, truth_from(reader), scores, run.device, shard)
     row = replace(_identified(run, strategy), **summary, **cost_fields(run, strategy))
     if row.fallbacks:
         log.warning("%s %s of %d", strategy.name, row.error, row.n_scenes)
         # where every scene fell back, the numbers are of the fields that distillation began with
         row = replace(row, status="diverged" if row.fallbacks == row.n_scenes else "ok")
+    if shard is not None:
+        write_shard(scores, run, strategy, row)
     with filelock.FileLock(run.folder / ".row.lock"):
         if _is_appended(run, row):
             log.info("another process, which made these scenes too, has appended the row of %s", row.run_id)
@@ -61,6 +69,21 @@ def _is_appended(run: EvaluationRun, row: ResultRow) -> bool:
                 if isinstance(other, dict) and (other.get("run_id"), other.get("status")) == (row.run_id, row.status):
                     return True
     return False
+
+
+def config_sha256(identity: Mapping[str, Any], cost_key: str, strategy: str, scoring: Mapping[str, Any]) -> str:
+    """A digest of all that a row's numbers depend on: what is predicted, what it costs, how it is scored."""
+    return sha256_values([identity, cost_key, strategy, scoring])
+
+
+def write_shard(scores: Path, run: EvaluationRun, strategy: Strategy, row: ResultRow) -> None:
+    """Leave beside a shard's scores what merging it takes; `SHARD` last, which says that the shard is complete."""
+    columns = scene_costs(run, strategy)
+    with atomic(scores / COSTS) as temporary:
+        columns.to_csv(temporary, index=False)
+    facts = {"identity": run.identity, "cost_key": run.cost_key, "strategy": strategy.name}
+    facts |= {"scoring": run.settings.scoring, "scenes": run.scene_ids, "row": asdict(row)}
+    write_text(scores / SHARD, json.dumps(encode(facts)) + "\n")
 
 
 def record_failure(
@@ -89,8 +112,7 @@ def record_failure(
 def _identified(run: EvaluationRun, strategy: Strategy) -> ResultRow:
     """Make the row of a run, before anything is measured."""
     settings = run.settings
-    # What the numbers depend on: the identity of the predictions and what they cost, the strategy, how it is scored.
-    config_hash = sha256_values([run.identity, run.cost_key, strategy.name, settings.scoring])
+    config_hash = config_sha256(run.identity, run.cost_key, strategy.name, settings.scoring)
     prior = getattr(strategy, "prior", None)
     return ResultRow(
         run_id=f"{settings.run_name}/{strategy.name}-{config_hash[:8]}",
@@ -107,6 +129,7 @@ def _identified(run: EvaluationRun, strategy: Strategy) -> ResultRow:
 def _asked_for(settings: RunSettings) -> dict[str, Any]:
     """Return the fields that the settings and the command tell."""
     known = {name: getattr(settings, name) for name in ("seed", "dataset", "stress", "severity", "neutral")}
+    known["shard"] = settings.shard and str(settings.shard)
     if not HydraConfig.initialized():
         return known
     return known | {"overrides": list(HydraConfig.get().overrides.task), "command": _command(HydraConfig.get())}

@@ -30,6 +30,8 @@ from nerfdiff.stress.stress import Stress, row_fields, stress_of
 from nerfdiff.utils.config import auto_precision, plain
 from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.hashes import sha256_file, sha256_values
+from nerfdiff.utils.shard import Shard
+from nerfdiff.utils.spread import spread
 
 log = logging.getLogger(__name__)
 
@@ -68,6 +70,7 @@ class RunSettings:
         progress_every: seconds between lines where there is no terminal.
         per_scene: leave every scene's field, trace and orbit beside its views.
         keep_steps: how many fields from on the way of distillation are left beside each scene's.
+        shard: of the scenes, that this run makes; None: all.
         stress, severity, neutral: what goes wrong on purpose, by how much, and how much is nothing; None: nothing.
     """
 
@@ -84,6 +87,7 @@ class RunSettings:
     keep_steps: int
     orbit: Orbit
     sheet: Sheet
+    shard: Shard | None
     stress: str | None
     severity: float | None
     neutral: float | None
@@ -100,6 +104,7 @@ class RunSettings:
             compiled=cfg.compile != "none",
             orbit=instantiate(cfg.orbit),
             sheet=instantiate(cfg.sheet),
+            shard=Shard.read(cfg.shard),
             **row_fields(stress_of(cfg)),
         )
 
@@ -110,6 +115,8 @@ class EvaluationRun:
 
     Args:
         load: reads the scenes of these ids, in batches of one.
+        scene_ids: of this run's scenes.
+        split_ids: of all scenes, of which a shard has a part.
         identity: all settings that predictions depend on.
         folder: holds all files of the run.
         stability: of the model's training, see `LoadedModel`.
@@ -126,6 +133,7 @@ class EvaluationRun:
     model: NerfDiff
     load: Callable[[Sequence[str]], Iterable[ViewBatch]]
     scene_ids: list[str]
+    split_ids: list[str]
     device: torch.device
     precision: str
     identity: dict[str, Any]
@@ -144,7 +152,7 @@ class EvaluationRun:
 
     def stressed(self, strategy: Strategy) -> Strategy:
         """Return the strategy with this run's stress, where it acts on virtual views or targets."""
-        return strategy if self.stress is None else self.stress.strategy(strategy, self.load, self.scene_ids)
+        return strategy if self.stress is None else self.stress.strategy(strategy, self.load, self.split_ids)
 
     def autocast(self) -> AbstractContextManager:
         return autocast(self.device, self.precision)
@@ -196,12 +204,14 @@ def dataset_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
     """
     loaded = _load(cfg)
     datamodule = instantiate(cfg.data)
+    datamodule.shard = None if (stress := stress_of(cfg)) is not None else Shard.read(cfg.shard)
     datamodule.setup("test")
     reader = datamodule.reader("test")
-    scene_ids = [reader.scene_id(index) for index in datamodule.test_set.indices]
-    if (stress := stress_of(cfg)) is not None:
+    split_ids = [reader.scene_id(index) for index in spread(len(reader), datamodule.eval_scenes)]
+    if stress is not None:  # which may show a scene another one's images
         stress.inputs(datamodule.test_set)
-    position = {name: index for index, name in enumerate(scene_ids)}
+    position = {reader.scene_id(index): place for place, index in enumerate(datamodule.test_set.indices)}
+    scene_ids = split_ids if (shard := Shard.read(cfg.shard)) is None else list(shard.share(split_ids))
 
     def load(names: Sequence[str]) -> Iterable[ViewBatch]:
         return datamodule.scenes([position[name] for name in names])
@@ -214,14 +224,16 @@ def dataset_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
             f"set data.image_size=[{loaded.image_size[0]},{loaded.image_size[1]}]"
         )
     facts = {
-        "split_sha256": sha256_values(scene_ids),
+        "split_sha256": sha256_values(split_ids),
         "files_sha256": reader.fingerprint(),
         "reader": reader.identity,
         "views": [cfg.data.source_view, cfg.data.eval_stride],
         "image_size": size,
         "mean_image_scenes": cfg.get("mean_image_scenes"),  # a baseline of evaluate.py
     }
-    return _run(cfg, device, loaded, load, scene_ids, facts, datamodule, stress)
+    if shard is not None:
+        facts["shard"] = str(shard)
+    return _run(cfg, device, loaded, load, scene_ids, split_ids, facts, datamodule, stress)
 
 
 def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
@@ -234,6 +246,8 @@ def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
     size = loaded.image_size or plain(cfg.picture_size)
     if size is None:
         raise ConfigError(f"{loaded.path} does not say what image size it is for: give picture_size=[height,width]")
+    if cfg.shard is not None:
+        raise ConfigError(f"shard={cfg.shard} is of a dataset's scenes, and image={cfg.image} is one picture")
     if (stress := stress_of(cfg)) is not None and stress.input_view is not None:
         raise ConfigError(f"stress={stress.axis} chooses another input view, and a picture has none")
     cfg = framed_as_trained(cfg, loaded)
@@ -245,7 +259,8 @@ def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
         "picture_views": plain(cfg.picture_views),
         "image_size": list(size),
     }
-    return _run(cfg, device, loaded, lambda names: [scene] * len(names), list(scene.scene_ids), facts, None, stress)
+    ids = list(scene.scene_ids)
+    return _run(cfg, device, loaded, lambda names: [scene] * len(names), ids, ids, facts, None, stress)
 
 
 def framed_as_trained(cfg: DictConfig, loaded: LoadedModel) -> DictConfig:
@@ -295,6 +310,7 @@ def _run(
     loaded: LoadedModel,
     load: Callable[[Sequence[str]], Iterable[ViewBatch]],
     scene_ids: list[str],
+    split_ids: list[str],
     facts: dict[str, Any],
     data: SceneDataModule | None,
     stress: Stress | None,
@@ -342,6 +358,7 @@ def _run(
         model=model,
         load=load if mend is None else lambda names: map(mend, load(names)),
         scene_ids=scene_ids,
+        split_ids=split_ids,
         device=device,
         precision=precision,
         identity=identity,

@@ -105,9 +105,9 @@ def load_field(path: str | Path) -> SavedField:
 
 
 def save_steps(folder: Path, saved: SavedField, fields: Mapping[int, RefinedField]) -> None:
-    """Write fields from on the way to `saved`, by how many steps had been done, into a field's folder, as float16."""
+    """Write fields from on the way to `saved`, by how many steps had been done, into a field's folder."""
     for done, field in fields.items():
-        save_field(folder / STEPS / f"{done:04d}.safetensors", replace(saved, field=field), torch.float16)
+        save_field(folder / STEPS / f"{done:04d}.safetensors", replace(saved, field=field))
 
 
 def load_steps(path: str | Path) -> dict[int, SavedField]:

@@ -80,6 +80,7 @@ class PredictionWriter:
     def __init__(self, root: str | Path, strategy: str, scenes: Sequence[str], identity: Mapping[str, Any]):
         self.folder = Path(root) / _name(strategy)
         self.scenes = tuple(_name(scene) for scene in scenes)
+        self._numbers = {scene: number for number, scene in enumerate(self.scenes)}
         self._claims: IO[bytes] | None = None
         plan = {"format": FORMAT, "identity": json.loads(json.dumps(identity)), "scenes": list(self.scenes)}
         if (self.folder / PLAN).exists() and not self._is_lost():
@@ -121,7 +122,7 @@ class PredictionWriter:
             self._claims = open(self.folder / ".claims", "a+b")  # noqa: SIM115  (closing it releases all)
         try:
             # of each scene one byte, which may lie beyond the file's end
-            fcntl.lockf(self._claims, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB), 1, self.scenes.index(scene))
+            fcntl.lockf(self._claims, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB), 1, self._numbers[scene])
         except (BlockingIOError, PermissionError):  # what a lock that another holds is, by POSIX
             return False
         if not (self.folder / scene / SCENE).exists():
@@ -132,7 +133,7 @@ class PredictionWriter:
 
     def release(self, scene: str) -> None:
         """Let other processes make a scene that was claimed."""
-        fcntl.lockf(self._claims, fcntl.LOCK_UN, 1, self.scenes.index(scene))
+        fcntl.lockf(self._claims, fcntl.LOCK_UN, 1, self._numbers[scene])
 
     def write(
         self,
@@ -162,7 +163,7 @@ class PredictionWriter:
             NonFinitePrediction: an image has NaN or infinite values.
             DataError: the scene is not in the plan, or cannot be written.
         """
-        if scene_id not in self.scenes:
+        if scene_id not in self._numbers:
             raise DataError(f"scene {scene_id!r} is not one of the scenes of {self.folder / PLAN}")
         if len(views) != len(images) or (depth is None) != (opacity is None):
             raise ValueError(f"{len(views)} names for {len(images)} images; depth and opacity come together")

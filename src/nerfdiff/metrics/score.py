@@ -19,13 +19,14 @@ from nerfdiff.metrics import image as image_metrics
 from nerfdiff.metrics.consistency import Consistency
 from nerfdiff.metrics.perceptual import LPIPS, LPIPS_NET, LPIPS_VGG, STLPIPS
 from nerfdiff.metrics.predictions import SCENE, Prediction, read_plan, read_prediction
-from nerfdiff.metrics.sets import FrechetDistance, InceptionFeatures, inception_weights
+from nerfdiff.metrics.sets import SETS, FrechetDistance, InceptionFeatures, inception_weights, sets, write_statistics
 from nerfdiff.metrics.summary import FACTS, SPENT, SceneScores, Value, summarise, write_csv
 from nerfdiff.metrics.table import METRICS, PACKAGE, named
 from nerfdiff.metrics.table import own as own_metrics
 from nerfdiff.metrics.whole_scene import Geometry, WholeScene
 from nerfdiff.utils.errors import DataError
 from nerfdiff.utils.files import encode, write_text
+from nerfdiff.utils.shard import Shard
 
 Truth = Callable[[str, Sequence[str]], Scene]
 
@@ -99,14 +100,20 @@ class Scorer:
         self.fid_weights = inception_weights(fid_weights) if fid else None
 
     def score(
-        self, folder: str | Path, truth: Truth, out: str | Path, device: torch.device | str = "cpu"
+        self,
+        folder: str | Path,
+        truth: Truth,
+        out: str | Path,
+        device: torch.device | str = "cpu",
+        shard: Shard | None = None,
     ) -> dict[str, Value]:
         """Score the predictions of one strategy.
 
         Args:
             folder: `<predictions>/<strategy>`, written by `PredictionWriter`.
             truth: the true views of a scene, see `truth_from`.
-            out: receives per_image.csv, per_scene.csv and summary.json.
+            out: receives per_image.csv, per_scene.csv and summary.json; of a shard `SETS`, too.
+            shard: that the scenes are, of a larger set.
 
         Returns:
             the summary: metrics (None where not measured), which variants they are and over how many images,
@@ -125,10 +132,10 @@ class Scorer:
         session = _Session(self, torch.device(device))
         quiet = not sys.stderr.isatty()
         scenes = [
-            session.scene(number, folder, scene, truth)
+            session.scene(shard.index(number) if shard else number, folder, scene, truth)
             for number, scene in enumerate(track(planned, escape(f"scoring {folder.name}"), disable=quiet))
         ]
-        summary = summarise(scenes) | session.sets()
+        summary = summarise(scenes) | sets(session.fid, session.fd_st_vgg)
         summary["ssim_impl"] = image_metrics.SSIM_IMPL
         summary["lpips_net"] = LPIPS_NET if self.lpips_weights else None
         described = {metric.name: {"value": summary[metric.name], **metric.description()} for metric in self.own}
@@ -138,6 +145,8 @@ class Scorer:
         write_csv(out / "per_image.csv", ("scene", "view", *named("image")), rows)
         per_scene = [scene.row() for scene in scenes]
         write_csv(out / "per_scene.csv", (*FACTS, *SPENT, *named("image", "scene")), per_scene)
+        if shard is not None:
+            write_statistics(out / SETS, fid=session.fid, fd_st_vgg=session.fd_st_vgg)
         write_text(out / "summary.json", json.dumps(encode(summary), indent=1, allow_nan=False) + "\n")
         return summary
 
@@ -151,7 +160,6 @@ class _Session:
         self.st_lpips = STLPIPS(device, scorer.min_size) if scorer.st_lpips else None
         self.inception = InceptionFeatures(scorer.fid_weights, device) if scorer.fid_weights else None
         self.fid, self.fd_st_vgg = FrechetDistance(), FrechetDistance()
-        self.images = 0
 
     def scene(self, number: int, folder: Path, scene_id: str, truth: Truth) -> SceneScores:
         prediction = read_prediction(folder, scene_id)
@@ -168,7 +176,6 @@ class _Session:
         ):
             for metric, measured in self._batch(pixels, true_pixels).items():
                 values.setdefault(metric, []).extend(measured)
-        self.images += len(prediction.views)
         blank = bool((scene.pixels == 255).all())
         values |= self._geometry(prediction, scene)
         whole = {}
@@ -219,9 +226,3 @@ class _Session:
         if mask is not None:
             values["mask_iou"] = depth_metrics.mask_iou(prediction.opacity, mask, threshold)
         return values
-
-    def sets(self) -> dict[str, Value]:
-        """Distances between all predictions and all truth; `fid_n` images stand on either side of both."""
-        fid, fd_st_vgg = self.fid.compute(), self.fd_st_vgg.compute()
-        measured = fid is not None or fd_st_vgg is not None
-        return {"fid": fid, "fd_st_vgg": fd_st_vgg, "fid_n": self.images if measured else None}

@@ -1,16 +1,24 @@
 """Distances between sets of images: the Fréchet distance of two Gaussians fitted to features, and FID."""
 
 import logging
+import zipfile
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerfdiff.metrics.weights import WeightsFile
+from nerfdiff.utils.errors import DataError
+from nerfdiff.utils.files import atomic
 
 log = logging.getLogger(__name__)
+
+SETS = "sets.npz"
+"""Statistics of a shard's features."""
 
 
 class GaussianStatistics:
@@ -32,7 +40,10 @@ class GaussianStatistics:
             return
         mean = features.mean(dim=0)
         centred = features - mean
-        scatter = centred.T @ centred
+        self.merge(count, mean, centred.T @ centred)
+
+    def merge(self, count: int, mean: Float[Tensor, "dim"], scatter: Float[Tensor, "dim dim"]) -> None:
+        """Add `count` vectors, of which mean and sum of squares around it are known; all in float64."""
         if self.count == 0:
             self.count, self.mean, self._scatter = count, mean, scatter
             return
@@ -41,6 +52,22 @@ class GaussianStatistics:
         self._scatter += scatter + torch.outer(shift, shift) * (self.count * count / total)
         self.mean = self.mean + shift * (count / total)
         self.count = total
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return what `merge_arrays` reads; of the symmetric matrix one half."""
+        if self.count == 0:
+            return {"count": np.array(0)}
+        half = self._scatter[*torch.triu_indices(*self._scatter.shape)]
+        return {"count": np.array(self.count), "mean": self.mean.numpy(), "scatter": half.numpy()}
+
+    def merge_arrays(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Add the vectors of other statistics."""
+        if not (count := int(arrays["count"])):
+            return
+        mean, half = torch.from_numpy(arrays["mean"]), torch.from_numpy(arrays["scatter"])
+        scatter = half.new_zeros(len(mean), len(mean))
+        scatter[*torch.triu_indices(*scatter.shape)] = half
+        self.merge(count, mean, scatter + scatter.triu(1).T)
 
     @property
     def covariance(self) -> Float[Tensor, "dim dim"]:
@@ -84,12 +111,53 @@ class FrechetDistance:
         self.predictions.update(predictions)
         self.truth.update(truth)
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return what `merge_arrays` reads."""
+        sides = {"predictions": self.predictions, "truth": self.truth}
+        return {f"{side}_{name}": value for side, of in sides.items() for name, value in of.arrays().items()}
+
+    def merge_arrays(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Add both streams of another distance."""
+        for side in ("predictions", "truth"):
+            prefix = f"{side}_"
+            of = {name.removeprefix(prefix): value for name, value in arrays.items() if name.startswith(prefix)}
+            getattr(self, side).merge_arrays(of)
+
     def compute(self) -> float | None:
         """The distance; None with fewer than two images on a side, where there is no covariance."""
         if min(self.predictions.count, self.truth.count) < 2:
             return None
         p, t = self.predictions, self.truth
         return frechet_distance(p.mean, p.covariance, t.mean, t.covariance)
+
+
+def sets(fid: FrechetDistance, fd_st_vgg: FrechetDistance) -> dict[str, float | int | None]:
+    """Distances between all predictions and all truth; `fid_n` images stand on either side of both."""
+    values = {"fid": fid.compute(), "fd_st_vgg": fd_st_vgg.compute()}
+    counts = [of.truth.count for of in (fid, fd_st_vgg) if of.truth.count > 1]
+    return values | {"fid_n": max(counts, default=None)}
+
+
+def write_statistics(path: Path, **distances: FrechetDistance) -> None:
+    """Write what is known of the features so far, from which `add_statistics` goes on; see `atomic`."""
+    with atomic(path) as temporary:
+        arrays = {f"{name}/{key}": value for name, of in distances.items() for key, value in of.arrays().items()}
+        np.savez(temporary, **arrays)
+
+
+def add_statistics(path: Path, **distances: FrechetDistance) -> None:
+    """Add the features that `write_statistics` wrote of.
+
+    Raises:
+        DataError: the file is missing or damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            for name, distance in distances.items():
+                mine = [key for key in arrays if key.startswith(f"{name}/")]
+                distance.merge_arrays({key.partition("/")[2]: arrays[key] for key in mine})
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, RuntimeError) as error:
+        raise DataError(f"{path}: cannot be read ({error}); run its shard again") from error
 
 
 def inception_weights(path: str | Path | None = None) -> Path | None:

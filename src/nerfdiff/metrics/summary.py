@@ -2,7 +2,7 @@
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
@@ -62,17 +62,30 @@ def summarise(scenes: Sequence[SceneScores]) -> dict[str, Value]:
 
     Blank scenes count. Where there are any, `<metric>_without_blank` says what the others alone give.
     """
-    summary: dict[str, Value] = {
-        "n_scenes": len(scenes),
-        "n_views": sum(len(scene.views) for scene in scenes),
-        "blank_scenes": sum(scene.blank for scene in scenes),
-    }
-    summary |= {m: _mean([scene.mean(m) for scene in scenes]) for m in named("image", "scene")}
-    summary["consistency_n"] = sum(scene.mean("consistency_psnr") is not None for scene in scenes) or None
-    if summary["blank_scenes"]:
-        others = [scene for scene in scenes if not scene.blank]
-        for m in (metric.name for metric in PACKAGE if metric.compared):
-            summary[f"{m}_without_blank"] = _mean([scene.mean(m) for scene in others])
+    views = sum(len(scene.views) for scene in scenes)
+    blank = [scene.blank for scene in scenes]
+    return summarise_columns(lambda metric: [scene.mean(metric) for scene in scenes], blank, views)
+
+
+def summarise_columns(
+    column: Callable[[str], Sequence[float | None]], blank: Sequence[bool], views: int
+) -> dict[str, Value]:
+    """As `summarise`.
+
+    Args:
+        column: gives a metric's value of each scene.
+        blank: of each scene.
+        views: of all scenes.
+    """
+    summary: dict[str, Value] = {"n_scenes": len(blank), "n_views": views, "blank_scenes": sum(blank)}
+    for metric in named("image", "scene"):
+        values = column(metric)
+        summary[metric] = _mean(values)
+        if metric == "consistency_psnr":
+            summary["consistency_n"] = sum(value is not None for value in values) or None
+        if summary["blank_scenes"] and metric in METRICS and METRICS[metric].compared and METRICS[metric] in PACKAGE:
+            others = [value for value, white in zip(values, blank, strict=True) if not white]
+            summary[f"{metric}_without_blank"] = _mean(others)
     return summary
 
 

@@ -92,13 +92,17 @@ def find_results(path: str | Path, onerror: Callable[[OSError], object] | None =
 
 
 def read_runs(file: Path | RowFile, roots: tuple[Path, ...] = ()) -> list[Run]:
-    """The runs of one file of results, oldest first.
+    """The runs of one file of results, oldest first. Shards of a run are none: merged, they have a row of their own.
 
     Raises:
         DataError: see `RowFile.read`.
     """
     file = file if isinstance(file, RowFile) else RowFile(file)
-    return [Run(row, file.path.parent, roots) for row in file.read()]
+    rows = file.read()
+    whole = [Run(row, file.path.parent, roots) for row in rows if row.shard is None]
+    if len(whole) < len(rows):
+        log.info("%s: %d rows are of shards, and left out", file.path, len(rows) - len(whole))
+    return whole
 
 
 def newest(runs: Sequence[Run]) -> list[Run]:

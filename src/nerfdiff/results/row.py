@@ -59,6 +59,7 @@ class _Identity:
     seed: int | None = None
     dataset: str | None = None
     split_sha256: str | None = None
+    shard: str | None = None
     n_scenes: int | None = None
     n_views: int | None = None
     image_size: list[int] | None = None
@@ -87,6 +88,7 @@ class ResultRow(make_dataclass("_Measured", _NUMBERS, bases=(_Identity,), kw_onl
     """One measured run. None means not measured or not applicable.
 
     `stress` is what went wrong on purpose, `severity` by how much in its own unit, `neutral` the severity of no stress.
+    `shard` is the part of the split (3/100) that a job of many made; `split_sha256` is of the whole split.
     `folder` is where predictions and scores lie, relative to the file of results. `command` makes the row again.
     Timings are dicts {n, median, iqr} in seconds, see `timing`: `encode_s` per image, `render_s` per view (of all
     predicted views of a scene in one call), the others per scene. `scene_s` is a scene from its input image to all its
@@ -281,7 +283,7 @@ class RowFile:
             whole = reason is not None or line.endswith(b"\n")
             if reason is None and line.strip():
                 try:
-                    self.rows.append(_parse(line, self._words))
+                    self.rows.append(parse_row(line, self._words))
                     whole = True
                 except RecursionError:
                     reason = "nested too deep"
@@ -319,8 +321,12 @@ class ForeignRow(ValueError):
     """A whole row, of another schema."""
 
 
-def _parse(line: bytes, words: dict[str, str]) -> ResultRow:
-    """A row; equal texts of rows are one object in `words`."""
+def parse_row(line: bytes, words: dict[str, str]) -> ResultRow:
+    """A row; equal texts of rows are one object in `words`.
+
+    Raises:
+        ValueError: the line is no row, or not of this schema.
+    """
     try:
         values = json.loads(line.decode())
     except ValueError as error:

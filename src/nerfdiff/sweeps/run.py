@@ -1,6 +1,7 @@
 """One sweep from its first batch of jobs to its last, on whatever launcher."""
 
 import logging
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig, open_dict
 
 from nerfdiff.results.row import RESULTS, ResultRow, RowFile
+from nerfdiff.sweeps.cluster import JobDied, every_result
 from nerfdiff.sweeps.jobs import results_of
 from nerfdiff.sweeps.plan import write_plan
 from nerfdiff.sweeps.proposals import Proposals
@@ -22,6 +24,7 @@ from nerfdiff.utils.hashes import sha256_values
 
 log = logging.getLogger(__name__)
 
+NUMBER = re.compile(r"=[\d.,e+/-]+$")  # of an override; a shard's, too
 DEATHS = 5
 """Jobs that, each by itself, take their process along, while none ever came back, until the launcher is to blame."""
 
@@ -129,16 +132,23 @@ class Run:
         return [*job, f"hydra.sweep.subdir={get_valid_filename(name)}"]
 
     def _validate(self, batch: Sequence[Job]) -> None:
-        """Raises what Hydra raises of a job that cannot be composed, before the batch begins; one seed tells of all."""
-        for job in {job[: len(job) - bool(self.space.seeds)]: job for job in batch}.values():
+        """Raises what Hydra raises of a job that cannot be composed, before the batch begins.
+
+        Of jobs that differ in numbers alone, as in the seed, one tells of all: an array has thousands of them.
+        """
+        for job in {tuple(NUMBER.sub("=", word) for word in job): job for job in batch}.values():
             self.load(self.config, self._words(job))
 
-    def _launch(self, batch: Sequence[Job]) -> list[JobReturn]:
-        """Run a batch. Where the launcher itself fails, a job took its process along: then one job after the other."""
+    def _launch(self, batch: Sequence[Job], again: bool = False) -> list[JobReturn]:
+        """Run a batch. Where the launcher itself fails, a job took its process along: then one job after the other.
+
+        Jobs of a cluster that died without leaving a row are run `again`, together and once.
+        """
         before = self._rows()
         self.attempted.update(batch)
         try:
-            results = self.launcher.launch([self._words(job) for job in batch], initial_job_idx=self.launched)
+            with every_result(self.launcher):
+                results = self.launcher.launch([self._words(job) for job in batch], initial_job_idx=self.launched)
         except Exception as error:
             if len(batch) == 1:
                 self._record(batch[0], error)
@@ -153,12 +163,23 @@ class Run:
                     returns += self._launch([job])
             return returns
         self.launched += len(batch)
+        died: dict[Job, Exception] = {}
         for job, result in zip(batch, results, strict=True):
             try:
                 _ = result.return_value
+            except JobDied as error:
+                died[job] = error
             except Exception as error:
                 self.failures.append(f"{' '.join(set(job) & self.space.varied)} ({error})")
-        return list(results)
+        rows = self._rows()
+        lost = [job for job in died if len(rows.get(frozenset(job), ())) == len(before.get(frozenset(job), ()))]
+        returns = [result for job, result in zip(batch, results, strict=True) if job not in lost]
+        if lost and not again:
+            log.warning("%d of %d jobs died and are run again: %s", len(lost), len(batch), died[lost[0]])
+            return returns + self._launch(lost, again=True)
+        for job in lost:
+            self._record(job, died[job])
+        return returns
 
     def _record(self, job: Job, error: Exception) -> None:
         """A row for a job whose process is gone."""

@@ -10,6 +10,7 @@ import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from lightning import Trainer, seed_everything
+from lightning.fabric.plugins.environments import SLURMEnvironment, TorchElasticEnvironment
 from omegaconf import DictConfig
 
 from nerfdiff.checkpoint import (
@@ -22,6 +23,7 @@ from nerfdiff.checkpoint import (
     last_checkpoint,
     load_model,
     read_checkpoint,
+    steps_of,
 )
 from nerfdiff.compilation import compile_unets
 from nerfdiff.data.datamodule import SceneDataModule
@@ -42,8 +44,11 @@ from nerfdiff.utils.config import auto_precision, plain
 from nerfdiff.utils.errors import CheckpointError, ConfigError, ProcessLost, TrainingDiverged
 from nerfdiff.utils.files import held, remove_leftovers
 from nerfdiff.utils.hashes import sha256_file, sha256_values
+from nerfdiff.utils.rank import set_rank
 
 log = logging.getLogger(__name__)
+
+PAPERS = 1e8  # parameters from which a model is of the paper's sizes
 
 
 def train(cfg: DictConfig) -> dict[str, float]:
@@ -68,6 +73,7 @@ def train(cfg: DictConfig) -> dict[str, float]:
     cfg, trainer = with_stress(cfg, "train"), None
     try:
         trainer = build_trainer(cfg)
+        set_rank(trainer.global_rank)
         with held(Path(cfg.paths.output_dir)) if trainer.is_global_zero else nullcontext():
             found = _train(cfg, trainer)
     except Exception as error:
@@ -103,9 +109,10 @@ def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
     if last is None:
         _begin(module, cfg, model_config)
     compile_unets(module.model, cfg.compile, cfg.paths.compiled_dir)
-    _announce(module, last, trainer.strategy.root_device)
-    if trainer.is_global_zero and last is not None and last.name != LAST and (last.parent / LAST).exists():
-        os.replace(last.parent / LAST, last.parent / DAMAGED)  # else it would take the place of the one that is good
+    _announce(module, last, trainer, datamodule.batch_size)
+    damaged = output_dir / "checkpoints" / LAST
+    if trainer.is_global_zero and last is not None and damaged.exists() and steps_of(damaged) is None:
+        os.replace(damaged, damaged.with_name(DAMAGED))  # else it would take the place of the one that is good
 
     try:
         trainer.fit(module, datamodule, ckpt_path=last, weights_only=True)
@@ -186,7 +193,9 @@ def build_trainer(cfg: DictConfig) -> Trainer:
                 *(instantiate(callback) for callback in wanted.values() if callback is not None),
             ],
             enable_progress_bar=cfg.callbacks.get("progress") is not None,
-            plugins=[ClearCheckpointIO()],
+            plugins=[ClearCheckpointIO(), *_scheduler()],
+            # where Lightning looks for checkpoints that a scheduler made it write: not among those of other runs
+            default_root_dir=cfg.paths.output_dir,
             # Lightning counts batches where we count optimizer steps.
             val_check_interval=cfg.validation_every * cfg.trainer.accumulate_grad_batches,
             check_val_every_n_epoch=None,
@@ -194,6 +203,13 @@ def build_trainer(cfg: DictConfig) -> Trainer:
         )
     except InstantiationException as error:
         raise ConfigError(f"the trainer cannot be set up: {error.__cause__ or error}") from error
+
+
+def _scheduler() -> list[SLURMEnvironment]:
+    """Under Slurm's srun, its environment without Lightning's queueing again, which saves within steps."""
+    if TorchElasticEnvironment.detect() or not SLURMEnvironment.detect():
+        return []
+    return [SLURMEnvironment(auto_requeue=False)]
 
 
 def _checkpoint_to_resume(output_dir: Path, cfg: DictConfig, model_config: dict, data: SceneDataModule) -> Path | None:
@@ -235,7 +251,7 @@ def _sound(output_dir: Path) -> str:
     return f"{describe(last)} Its weights are finite: the same command goes on from there"
 
 
-def _announce(module: NerfDiffModule, last: Path | None, device: torch.device) -> None:
+def _announce(module: NerfDiffModule, last: Path | None, trainer: Trainer, batch_size: int) -> None:
     counts = module.model.parameter_count()
     state = WEIGHTS_ADAM_EMA * counts["total"] / 2**30
     log.info(
@@ -245,4 +261,13 @@ def _announce(module: NerfDiffModule, last: Path | None, device: torch.device) -
         *(counts[part] / 1e6 for part in ("total", "encoder", "denoiser")),
         state,
     )
-    log.info("%s on %s", f"resuming from {last}" if last else "starting afresh", device)
+    if trainer.world_size > 1:
+        where = f"{trainer.world_size} processes on {trainer.num_nodes} nodes"
+    else:
+        where = str(trainer.strategy.root_device)
+        if counts["total"] > PAPERS:
+            log.info(
+                "set for one device, with %d images a step on it; the paper's 8 GPUs: experiment=paper_8gpu model=%s",
+                *(batch_size, module.model.name),
+            )
+    log.info("%s on %s", f"resuming from {last}" if last else "starting afresh", where)

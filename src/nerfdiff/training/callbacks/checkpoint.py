@@ -13,11 +13,11 @@ from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import ModelCheckpoint
 
 from nerfdiff.checkpoint import DIVERGED, LAST, PREVIOUS
-from nerfdiff.processes import is_launched
-from nerfdiff.stopping import Stopped, on_signals
+from nerfdiff.stopping import GIVE_WAY, Stopped, on_signals
 from nerfdiff.training.callbacks.nonfinite import NonFiniteGuard
 from nerfdiff.utils.errors import CheckpointError, DataError, TrainingDiverged, size_text
 from nerfdiff.utils.files import atomic
+from nerfdiff.utils.rank import is_first
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +37,8 @@ class LastCheckpoint(SoundCheckpoint):
 
     It saves only between optimizer steps: halfway through an accumulation window the gradients gathered so far would
     be lost and the resumed run would differ from an uninterrupted one. So the first Ctrl-C or SIGTERM, to any of the
-    processes, lets the step end; the second ends the run at once.
+    processes, lets the step end; the same once more ends the run at once. (A scheduler may
+    send SIGTERM and another.)
 
     While steps go wrong nothing is saved. Where the run then diverges, a checkpoint that no good step followed is set
     aside as `diverged.ckpt`, and the one before takes its place. Where not even the first
@@ -60,6 +61,7 @@ class LastCheckpoint(SoundCheckpoint):
         self._proven = False  # whether a good step followed the last checkpoint
         self._well = False  # whether any step of this process was good
         self._signum = 0
+        self._asked: set[int] = set()
         self._agreed = False  # whether all processes end after the same step
         self._handlers = ExitStack()
 
@@ -118,10 +120,14 @@ class LastCheckpoint(SoundCheckpoint):
         super().on_train_end(trainer, pl_module)
 
     def _ask(self, signum: int) -> None:
-        if self._signum:
+        if signum in self._asked:
             raise Stopped(signum)
-        self._signum = signum
-        if not is_launched():
+        self._asked.add(signum)
+        if self._signum not in GIVE_WAY:  # it says more than SIGTERM beside it
+            self._signum = signum
+        if len(self._asked) > 1:
+            return
+        if is_first():
             log.warning("stopping: this step ends and is saved first; asked once more, the run ends at once")
 
     def _save_if_sound(self, trainer: Trainer) -> None:

@@ -9,7 +9,7 @@ from striped import picture, scene
 import nerfdiff
 from nerfdiff.cli import load_config
 from nerfdiff.inputs import ASSETS
-from nerfdiff.stability.facts import facts
+from nerfdiff.stability.facts import facts, of_picture
 from nerfdiff.stability.familiar import Familiar
 from nerfdiff.stability.mend import Mend, mend_of
 from nerfdiff.stress import cutout, framing, photo
@@ -22,7 +22,7 @@ DRAWS = torch.Generator().manual_seed(0)
 def mend() -> Mend:
     known = torch.cat([facts(scene(picture(number))) for number in range(200)])
     features = torch.randn(200, 4, generator=torch.Generator().manual_seed(0))
-    return Mend(Familiar.of(features, 2, known), 0.2, 4, [-0.5, -0.25, 0.25, 0.5, 1.0, 2.0, 4.0])
+    return Mend(Familiar.of(features, 2, known), 0.2, 4, [0.25, 0.5, 1.0, 2.0, 4.0])
 
 
 def error(image: torch.Tensor, truth: torch.Tensor) -> float:
@@ -73,10 +73,11 @@ def test_a_soft_picture_is_sharpened_towards_the_true_one(mend):
         lambda image: photo.contrast(image, 0.5, DRAWS),
         lambda image: framing.off_centre(image, 6 / 48, DRAWS),  # whole pixels: nothing is softened
         lambda image: photo.brightness(image, 0.1, DRAWS),
+        lambda image: photo.noise(image, 0.2, DRAWS),
     ],
 )
-def test_levels_and_place_stay_as_they_are_given(mend, change):
-    """They may be true: nothing in a picture tells a bright object from a bright light."""
+def test_levels_place_and_noise_stay_as_they_are_given(mend, change):
+    """Levels and place may be true. Softening a noisy picture costs more than its noise."""
     kept = [change(picture(number)) for number in range(1000, 1010)]
     assert sum(torch.equal(mend.picture(image)[0], image) for image in kept) >= 8
 

@@ -10,7 +10,7 @@ import numpy as np
 from nerfdiff.metrics.predictions import SCENE
 from nerfdiff.results.frame import Run
 from nerfdiff.stability.breaking import Rules
-from nerfdiff.stability.judge import ENDS, LEAST, MOST
+from nerfdiff.stability.judge import ENDS, LEAST, MOST, OK
 from nerfdiff.stability.study import read_scenes
 from nerfdiff.stress.axes import stress_files
 from nerfdiff.utils.hashes import sha256_values
@@ -23,12 +23,13 @@ Limits = dict[tuple[str, str], float]
 
 @dataclass(frozen=True)
 class Sample:
-    """A predicted scene: its signs, and whether it is broken by the truth."""
+    """A predicted scene: its signs, whether it is broken by the truth, and whether it fell back: always told."""
 
     axis: str
     scene: str
     signs: Mapping[str, float]
     broken: bool
+    fell_back: bool = False
 
 
 def suspected(limits: Limits, signs: Mapping[str, float]) -> bool:
@@ -43,7 +44,7 @@ def suspected(limits: Limits, signs: Mapping[str, float]) -> bool:
 
 def rates(limits: Limits, samples: Sequence[Sample]) -> tuple[float, float]:
     """Return recall (of the broken, the share that is suspected) and false alarms (of the others, that share)."""
-    said = np.array([suspected(limits, sample.signs) for sample in samples], dtype=bool)
+    said = np.array([sample.fell_back or suspected(limits, sample.signs) for sample in samples], dtype=bool)
     broken = np.array([sample.broken for sample in samples], dtype=bool)
     recall = float(said[broken].mean()) if broken.any() else math.nan
     return recall, float(said[~broken].mean()) if (~broken).any() else math.nan
@@ -61,7 +62,7 @@ def fit_limits(samples: Sequence[Sample], false_alarms: float, steps: int, margi
     names = sorted({name for sample in samples for name in sample.signs})
     values = {name: np.array([sample.signs.get(name, math.nan) for sample in samples], float) for name in names}
     slack = {name: margin * _spread(values[name][~broken]) for name in names}
-    told, limits = np.zeros(len(samples), dtype=bool), Limits()
+    told, limits = np.array([sample.fell_back for sample in samples], dtype=bool), Limits()
     allowed = math.floor(false_alarms * int((~broken).sum()))
     for _ in range(steps):
         best, gain = None, (max(1, round(GAIN * int(broken.sum()))), -len(samples))
@@ -131,7 +132,7 @@ def samples_of(runs: Sequence[Run], rules: Rules) -> list[Sample]:
             own = clean.get((run.row.strategy, run.row.seed, scene), math.nan)
             broken = outcome.failed or own - outcome.psnr >= rules.clean
             numbers = {name: float(value) for name, value in signs.items()}
-            found.append(Sample(run.row.stress or "none", scene, numbers, bool(broken)))
+            found.append(Sample(run.row.stress or "none", scene, numbers, bool(broken), outcome.status != OK))
     return found
 
 

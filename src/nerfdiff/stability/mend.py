@@ -24,21 +24,20 @@ from nerfdiff.stress.cutout import grown
 from nerfdiff.stress.photo import Picture, object_mask
 from nerfdiff.utils.hashes import sha256_values
 
-IN_RANGE = ("size", "share", "edge", "second_edge", "sharpness", "steepness")
-"""Facts that must be usual once an edge was peeled off."""
+EDGE = ("edge", "second_edge")
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Mend:
-    """Mends inputs, one after another: it removes specks, peels the object's edge, and sharpens or softens.
+    """Mends inputs, one after another: it removes specks, peels the object's edge, and sharpens.
 
     Args:
         familiar: of the model's training images, with ranges.
         beyond: widths of its range that a fact must lie beyond before it is mended.
         most_peeled: pixels of the object's edge that may go, where they are too even: a mask that was too large.
-        strengths: of an unsharp mask, of which the one is taken that brings the sharpness nearest to the training
-            images' median; negative ones soften.
+        strengths: of an unsharp mask, of which a soft picture gets the one that brings its sharpness nearest to the
+            training images' median.
     """
 
     familiar: Familiar
@@ -78,7 +77,7 @@ class Mend:
             done.append(f"{pixels} removed")
         if strength:
             image = _sharpened(image, strength)
-            done.append(f"it was {'sharpened' if strength > 0 else 'softened'} by {abs(strength):g}")
+            done.append(f"it was sharpened by {strength:g}")
         return image, done
 
     def _edge_and_sharpness(self, image: Picture) -> tuple[int, float]:
@@ -89,21 +88,24 @@ class Mend:
         mask = object_mask(image)
         for pixels in range(self.most_peeled + 1):
             left = grown(mask, -pixels)
-            if not left.any():
+            if not left.any() or (pixels == 1 and self._usual(image, EDGE)):
                 break
             peeled = _on_white(image, left)
             strength = self._strength(peeled)
-            beyond = self.familiar.picture_beyond(_sharpened(peeled, strength))
-            if max(beyond.get(name, 0.0) for name in IN_RANGE) <= self.beyond:
+            if self._usual(_sharpened(peeled, strength), (*EDGE, "size", "share", "sharpness", "steepness")):
                 return pixels, strength
         return 0, self._strength(image)
 
     def _strength(self, image: Picture) -> float:
-        beyond = self.familiar.picture_beyond(image)
-        if max(beyond.get("sharpness", 0.0), beyond.get("steepness", 0.0)) <= self.beyond:
-            return 0.0
+        """Of sharpening a soft picture; 0 for others: to soften a noisy one costs more than its noise."""
         usual = self.familiar.usual_value("sharpness")
+        if of_picture(image)["sharpness"] > usual or self._usual(image, ("sharpness", "steepness")):
+            return 0.0
         return min((0.0, *self.strengths), key=lambda s: abs(of_picture(_sharpened(image, s))["sharpness"] - usual))
+
+    def _usual(self, image: Picture, names: Sequence[str]) -> bool:
+        beyond = self.familiar.picture_beyond(image)
+        return max(beyond.get(name, 0.0) for name in names) <= self.beyond
 
 
 def mend_of(cfg: DictConfig, familiar: Familiar | None) -> Mend | None:

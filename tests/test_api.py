@@ -40,7 +40,8 @@ def test_a_scene_shows_the_picture_and_its_other_sides(scene):
 def test_what_is_saved_is_the_scene(scene, tmp_path):
     path = scene.save(tmp_path / "car.safetensors")
     again = nerfdiff.load_scene(path, device="cpu")
-    assert np.array_equal(again.render(40), scene.render(40))
+    shown = (np.asarray(one.render(40), dtype=int) for one in (again, scene))
+    assert np.abs(np.subtract(*shown)).max() <= 1  # planes are rounded when they are saved
     scene.orbit(tmp_path / "car.gif", frames=2, height=16)
     again.save(tmp_path / "car.ply", "mesh.resolution=24", "mesh.colour_views=1", "points=100")
     assert Image.open(tmp_path / "car.gif").n_frames == 2 and (tmp_path / "car.ply").stat().st_size > 1000

@@ -17,7 +17,7 @@ PROJECT = Path(__file__).parents[1]
 SOURCES = ("pyproject.toml", "setup.py", "MANIFEST.in", "LICENSE", "README.md", "src", "conf", "assets")
 PIP = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
 FIRST = ("calibrate", "chart", "demo", "distill", "evaluate")
-COMMANDS = (*FIRST, "export", "inspect-data", "make-scenes", "picture", "train", "view")
+COMMANDS = (*FIRST, "export", "inspect-data", "make-scenes", "make-shards", "merge-shards", "picture", "train", "view")
 
 
 @pytest.fixture(scope="module")

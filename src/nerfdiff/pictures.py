@@ -109,7 +109,7 @@ def _identity(cfg: DictConfig, model: Model, image: Path, mask: Mask | None) -> 
     """A digest of all that a scene depends on."""
     files = [sha256_file(file) for file in (image, model.loaded.path, cfg.picture.mask) if file is not None]
     found = None if mask is None else mask.where.tobytes().hex()
-    settings = [plain(cfg[key]) for key in ("strategy", "picture", "picture_views", "mend_input", "mend")]
+    settings = [cfg.mend_input, *(plain(cfg[key]) for key in ("strategy", "picture", "picture_views", "mend"))]
     steps = [cfg.keep_steps] if cfg.keep_steps else []
     return sha256_values([files, found, settings, cfg.seed, str(model.device), *steps])
 

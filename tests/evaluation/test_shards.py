@@ -57,7 +57,7 @@ def merge(folder):
 
 def scenes_of(row, home):
     with open(home / row.folder / "scores" / row.strategy / "per_scene.csv") as file:
-        return {line["scene"]: line for line in csv.DictReader(file)}
+        return {line["scene"]: {k: v for k, v in line.items() if k != "distill"} for line in csv.DictReader(file)}
 
 
 @pytest.fixture(scope="module")

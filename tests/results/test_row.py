@@ -151,8 +151,8 @@ def test_what_a_writer_adds_is_read_once(tmp_path, monkeypatch):
     (first,) = file.read()
     append_row(path, row(run_id="2"))
     parsed = []
-    parse = rows_module._parse
-    monkeypatch.setattr(rows_module, "_parse", lambda line, words: parsed.append(line) or parse(line, words))
+    parse = rows_module.parse_row
+    monkeypatch.setattr(rows_module, "parse_row", lambda line, words: parsed.append(line) or parse(line, words))
     assert [r.run_id for r in file.read()] == ["1", "2"] and file.rows[0] is first and len(parsed) == 1
     line = line_with(run_id="3")
     with open(path, "a") as half:  # by somebody who does not lock

@@ -27,7 +27,7 @@ function neighbour(number, along, step) {
 function zoom(factor) {
   const around = ([low, high]) => [low, high].map((end) => (low + high) / 2 + ((end - (low + high) / 2) * factor));
   const { xaxis, yaxis } = $("plot")._fullLayout;
-  Plotly.relayout($("plot"), factor === 0 ? { "xaxis.range": $("plot").home.x, "yaxis.range": $("plot").home.y } : { "xaxis.range": around(xaxis.range), "yaxis.range": around(yaxis.range) });
+  Plotly.relayout($("plot"), factor === 0 ? { "xaxis.range": home.x, "yaxis.range": home.y } : { "xaxis.range": around(xaxis.range), "yaxis.range": around(yaxis.range) });
 }
 
 function movePoint(event) {

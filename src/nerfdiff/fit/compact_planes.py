@@ -14,8 +14,7 @@ from nerfdiff.render.renderer import Renderer
 from nerfdiff.trajectories import Upright
 
 BITS = (12, 16)
-"""Bits per value that are tried, fewest first. Fewer bits fit some fields, but importance samples then jump in views that
-were not checked."""
+"""Bits per value that are tried, fewest first. With fewer, importance samples jump in views that were not checked."""
 BOUND = 0.5 / 255
 """What no colour of the checked views may move by: half of what is promised of all views."""
 AZIMUTHS, ELEVATION, SIDE = (0.0, 72.0, 144.0, 216.0, 288.0), 20.0, 48

@@ -54,19 +54,22 @@ class Browser:
         self._send("GuiUpdateMessage", {"uuid": self.labels[label], "updates": {"value": value}})
 
     def picture(self) -> np.ndarray:
-        """Wait for the picture of a scene at rest [height, width, 3], which is packed less than those in motion."""
-        self.pictures = []
+        """Wait for the last picture of a scene at rest [height, width, 3], which is packed less than those in motion."""
+        self.pictures, rests = [], False
         while True:
-            packed = None
-            for message, data in self._receive():
+            try:
+                received = self._receive(0.5 if rests else 15.0)
+            except TimeoutError:
+                if rests:
+                    return self.pictures[-1]
+                raise
+            for message, data in received:
                 if label := message.get("props", {}).get("label"):
                     self.labels[label] = message["uuid"]
                 elif message["type"] == "BackgroundImageMessage" and message["rgb_data"] is not None:
                     image = Image.open(io.BytesIO(data(message["rgb_data"])))
                     self.pictures.append(np.asarray(image) / 255)
-                    packed = max(image.quantization[0])
-            if packed is not None and packed < 20:
-                return self.pictures[-1]
+                    rests = max(image.quantization[0]) < 20
 
     def _receive(self, seconds=15.0):
         raw = self.socket.recv(timeout=seconds)

@@ -54,7 +54,7 @@ class Browser:
         self._send("GuiUpdateMessage", {"uuid": self.labels[label], "updates": {"value": value}})
 
     def picture(self) -> np.ndarray:
-        """Wait for the last picture of a scene at rest [height, width, 3], which is packed less than those in motion."""
+        """Wait for the last picture of a scene at rest [height, width, 3]; it is packed less than those in motion."""
         self.pictures, rests = [], False
         while True:
             try:

@@ -1,4 +1,4 @@
-"""What merging the shards of many scenes costs: seconds and memory, on shards as distill.py leaves them.
+"""Measure what merging the shards of many scenes costs: seconds and memory, on shards as distill.py leaves them.
 
 python benchmarks/merge_shards.py 1000000 --shards 100
 """

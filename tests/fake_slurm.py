@@ -224,7 +224,7 @@ def act(what: str | None) -> None:
                 time.sleep(0.02)
             time.sleep(0.3)
             for number in numbers:
-                os.kill(os.getpid(), number)
+                signal.pthread_kill(threading.main_thread().ident, number)  # as from outside: it ends a sleep
 
         threading.Thread(target=later, daemon=True).start()
 

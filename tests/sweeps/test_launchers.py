@@ -145,7 +145,6 @@ def array(folder, count, policy, parallel=4):
     return read_rows(sweep / "results.jsonl"), jobs(cluster), (cluster / "scontrol.log").read_text().splitlines()
 
 
-@pytest.mark.faults
 def test_of_an_array_of_which_jobs_die_every_result_is_there_once(tmp_path):
     """Killed at the start, or when all was done but telling it; out of time; to give way: queued again, once."""
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="pip install hydra-submitit-launcher")

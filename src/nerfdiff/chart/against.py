@@ -1,4 +1,4 @@
-"""What configurations are compared with: the run of the reference strategy with their model, scene by scene."""
+"""Compare configurations with the reference strategy of the same model, scene by scene."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -36,7 +36,7 @@ def references_of(members: Sequence[int], found: Sequence[Configuration], strate
 
 
 def leave_fields(members: Sequence[int], found: Sequence[Configuration]) -> dict[int, bool]:
-    """Whether each configuration leaves a field (rather than views alone), as far as its row tells.
+    """Tell whether each configuration leaves a field (rather than views alone), as far as its row tells.
 
     Rows do not say it outright. A field has geometry to measure, and was fitted to K views where the denoiser was
     asked; baselines query none. Where no row of the panel has either, the strategy's name alone says it.
@@ -74,7 +74,7 @@ class Leads:
     known: dict[tuple[str, int, int], Estimate | None] = field(default_factory=dict)
 
     def __call__(self, metric: str, number: int, other: int) -> Estimate | None:
-        """How much more of the metric `number` has than `other`; None where there are no values of scenes."""
+        """Return how much more of the metric `number` has than `other`; None where there are no values of scenes."""
         key = metric, number, other
         if key not in self.known:
             own, theirs = (self.found[each].scenes.get(metric, {}) for each in (number, other))
@@ -94,7 +94,7 @@ class Leads:
         return "better" if ends[0] > 0 else "worse" if ends[1] < 0 else "level"
 
     def level_with(self, metric: str, best: int, among: Sequence[int]) -> list[int]:
-        """Those `among` of which no interval says that `best` is better, itself included."""
+        """Return `best` and those `among` that no interval tells from it."""
         return [number for number in among if number == best or self.verdict(metric, best, number) == "level"]
 
 

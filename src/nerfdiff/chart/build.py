@@ -228,7 +228,7 @@ def _marks(content: Measured) -> dict[str, Mark]:
 def _add_spending(
     entries: Sequence[dict[str, Any]], content: Measured, fidelity: str, points: int, warn: Callable[[str], object]
 ) -> None:
-    """What each scene took beside its difficulty, of the first configurations, `points` scenes of them in all."""
+    """Return what each scene took beside its difficulty, for the first configurations: `points` scenes at most."""
     for number, entry in enumerate(entries):
         reference = content.references[number]
         difficulty = {} if reference is None else content.found[reference].scenes.get(fidelity, {})

@@ -16,7 +16,7 @@ SHAPES = (
 
 @dataclass(frozen=True)
 class Mark:
-    """How a strategy looks: `marker` is matplotlib's name of the shape."""
+    """The colour and shape of a strategy; `marker` is matplotlib's name of the shape."""
 
     colour: str
     shape: str

@@ -130,7 +130,7 @@ def _point(axes: Axes, point: tuple[Estimate, Estimate], bar: tuple[float, float
 
 
 def _bar(difference: Estimate | None) -> tuple[float, float]:
-    """How far the interval of a difference reaches below and above it."""
+    """Return how far the interval of a difference reaches below and above it."""
     if difference is None or not has_interval(difference):
         return 0.0, 0.0
     return max(difference.mean - difference.low, 0.0), max(difference.high - difference.mean, 0.0)

@@ -1,4 +1,4 @@
-"""What was spent on each scene, beside how hard it is: the PSNR that the reference has on it."""
+"""Read what was spent on each scene, and how hard it is: the PSNR that the reference has on it."""
 
 import csv
 import json
@@ -19,7 +19,7 @@ FEWEST = 3  # scenes of which a rank correlation says something
 
 
 def is_adaptive(configuration: Configuration, spent: Sequence[Mapping[str, Mapping[str, Any]]]) -> bool:
-    """Whether its budget follows the scene: its overrides say so, or scenes that ended before their schedule did."""
+    """Return true if a budget follows the scene, by its overrides or by scenes that ended before their schedule."""
     settings = (word.lstrip("+").partition("=") for word in configuration.settings)
     said = any(
         key in ADAPTIVE or (key.partition(".")[0] == "budget" and "adaptive" in value) for key, _, value in settings

@@ -7,7 +7,7 @@ from nerfdiff.cli import entry_point
 
 @entry_point("merge_shards", "shards")
 def main(cfg: DictConfig) -> None:
-    """What is merged already stays as it is."""
+    """Merge the shards of a run; merging them again changes nothing."""
     from nerfdiff.evaluation.merge import merge_shards  # slow to import: not for --cfg
 
     merge_shards(cfg)

@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 FORMAT = 1
 HEAD = struct.Struct("<I25f")
-"""Of an image: CRC-32 of what follows it, camera-to-world, intrinsics."""
+"""The bytes before an image's pixels: the CRC-32 of all that follows, its camera-to-world matrix and its intrinsics."""
 KNOWN = 4096  # scenes that a process remembers
 IMAGES, SCENES = "images", "scenes"
 

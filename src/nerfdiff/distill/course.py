@@ -45,24 +45,18 @@ class Course:
             self.stopped_by, steps = DEADLINE, affordable
         if steps < 1:
             return False
-        if steps == 1:
-            self.until = float(self.steps)
-        elif self.stopped_by == AGREEMENT:
-            self.until = self.steps - 1.0  # the last step is the schedule's own
-        else:
-            self.until = self.position + max(1.0, left / steps)
+        self.until = float(self.steps) if steps == 1 else self.position + max(1.0, left / steps)
         return True
 
     def end_step(self, is_enough: bool = False) -> None:
         """Go to where the step ends.
 
         Args:
-            is_enough: what is left of the schedule shall be one long step and the schedule's last, whose guidance is
-                that of its end.
+            is_enough: what is left of the schedule shall be one step.
         """
         self.position, self.taken = self.until, self.taken + 1
-        if is_enough and self._most > self.taken + 2:
-            self.stopped_by, self._most = AGREEMENT, self.taken + 2
+        if is_enough and self._most > self.taken + 1:
+            self.stopped_by, self._most = AGREEMENT, self.taken + 1
 
 
 class Plateau:

@@ -335,7 +335,8 @@ class NGDModule(LightningModule):
             cameras = self._fitted if self.keeps_coarse else self.cameras
             cameras = self._chosen_of(cameras, fitted=self.keeps_coarse)
             renderer = self.settings.guidance(self._renderer)
-            if self._chosen is None and not self.keeps_coarse and self.settings.empty_below > 0:
+            leaves_empty = renderer.skip != "none" and self.settings.empty_below > 0
+            if leaves_empty and self._chosen is None and not self.keeps_coarse:
                 return self._render_again(renderer)
             rendering = self._render(cameras, renderer, self.keeps_coarse)
             if rendering.coarse is not None:

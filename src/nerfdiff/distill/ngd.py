@@ -155,7 +155,9 @@ class NGDTeacher:
             # denoise
             condition = rendered if self.on_current else None
             x0 = self.views.denoise(self._z, t.expand(len(self._z)), condition, self._deep)
-            self.gap = self.views.distance(to_unit(x0), rendered)
+            # compared with the last images, guided ones overshoot by w: a schedule must not end where w is large
+            is_blend = self.guidance.compare == "current"
+            self.gap = self.views.distance(to_unit(x0), rendered) if is_blend else None
             # guide
             self._last = self.guidance(x0, to_signed(rendered), self._last, t)
         # step to the next time

@@ -19,6 +19,7 @@ from nerfdiff.stability.breaking import (
     point_of,
     sides_of,
 )
+from nerfdiff.stability.silent import COLUMNS, Silent, silent_failures, silent_markdown, worst_of_each
 from nerfdiff.stability.study import studies
 from nerfdiff.stability.text import severity_text, to_markdown, training_markdown
 from nerfdiff.stress.axes import stress_files
@@ -101,7 +102,8 @@ def test_the_mean_is_with_and_without_scenes_that_fell_back_and_lost_ones_are_co
 )
 def test_a_broken_scene_is_silent_if_neither_status_nor_judge_tells(verdict, failed, silent):
     point = point_of(judged(own=outcomes(20.0, failed, verdict, a=16.0)), RULES, BOOTSTRAP)
-    assert point.broken_scenes == ((0, "a"), (1, "a"), (2, "a"))
+    assert [(each.seed, each.scene) for each in point.failures] == [(0, "a"), (1, "a"), (2, "a")]
+    assert {(each.rules, each.loss, each.harm) for each in point.failures} == {("b", 4.0, None)}
     assert len(point.silent) == silent and point.suspect == (30 if verdict and verdict != "ok" else 0)
 
 
@@ -179,6 +181,34 @@ def test_rows_of_a_sweep_give_the_verdicts_that_they_are_made_for(sweep):
     # at 1.5 nobody is told, at 2 the judge tells
     assert (by["ngd"].silent, by["ngd"].broken) == (2, 4) and (by["none"].silent, by["none"].broken) == (0, 2)
     assert by["none"].area == 1.0 and by["ngd"].area > 1.2
+
+
+def test_silent_failures_are_listed_with_their_rules_and_what_the_stress_adds(sweep):
+    (study,) = studies(sweep, stress_files(), RULES, BOOTSTRAP)
+    found = silent_failures(study)
+    assert [(each.words, each.strategy, each.failure.scene) for each in found] == [
+        ("focal length ×1.5 true", "ngd", scene) for scene in "ab"
+    ]
+    assert {key: found[0].line()[key] for key in COLUMNS[:6]} == {
+        "axis": "focal", "severity": 1.5, "strategy": "ngd", "seed": 0, "scene": "a", "rules": "bc",
+    }  # fmt: skip
+    # ngd is 1 dB better than none without stress, 1 dB worse with it
+    failure = found[0].failure
+    assert (failure.loss, failure.harm, failure.clean_harm) == pytest.approx((4.0, 1.0, -1.0))
+    assert found[0].harmed_by_stress(RULES) and [each.failure.scene for each in worst_of_each(found)] == ["a"]
+    text = silent_markdown(found, RULES)
+    assert text.startswith("2 scenes by rule (b), 0 by rule (c) alone.")
+    assert "| focal length ×1.5 true | 2 | 2 | ngd | ngd, a, seed 0 (bc) | 4.00 | 1.00 |" in text
+
+
+@pytest.mark.parametrize(("clean", "by_stress"), [(20.0, True), (19.2, False), (19.0, False), (21.0, True)])
+def test_a_strategy_that_is_worse_than_none_without_stress_too_is_told_apart(clean, by_stress):
+    own = {(0, "a"): Outcome(18.4)}
+    none, before = {(0, "a"): Outcome(19.0)}, {(0, "a"): Outcome(20.0)}
+    case = Judged(1.0, own, {(0, "a"): Outcome(clean)}, none, {}, clean_none=before)
+    (failure,) = point_of(case, RULES, BOOTSTRAP).failures
+    each = Silent(stress_files()["focal"], 1.0, "ngd", failure, None)
+    assert failure.rules == "c" and each.harmed_by_stress(RULES) == by_stress
 
 
 def test_verdicts_are_written_as_tables_in_the_axis_own_units(sweep):

@@ -54,7 +54,7 @@ class Verdict:
 
     @property
     def broken(self) -> int:
-        return sum(len(point.broken_scenes) for point in self.points)
+        return sum(len(point.failures) for point in self.points)
 
 
 @dataclass(frozen=True)
@@ -127,6 +127,7 @@ def _study(
                     own if others else baseline,
                     _frechet(by_point[axis, severity, strategy]),
                     [] if others else _frechet(clean_runs.get(strategy, ())),
+                    {} if others or strategy == "none" else clean.get("none", {}),
                 )
     points = {
         key: {severity: point_of(each, rules, bootstrap) for severity, each in own.items()}

@@ -92,12 +92,12 @@ def _lines(study: Study) -> list[list[str]]:
         for point in verdict.points:
             loss = point.loss
             ends = "" if loss is None or loss.low is None else f" [{loss.low:.2f}, {loss.high:.2f}]"
-            first = min((scene for _, scene in point.broken_scenes), default="–")
+            first = min((failure.scene for failure in point.failures), default="–")
             rows.append(
                 [
                     *(stress.name, verdict.strategy, severity_text(stress, point.severity)),
-                    _number(point.psnr.mean),
-                    _number(point.without_fallbacks),
+                    number_text(point.psnr.mean),
+                    number_text(point.without_fallbacks),
                     "–" if loss is None else f"{loss.mean:.2f}{ends}",
                     *(f"{point.failed} of {point.total}", str(point.suspect), point.broken or "–"),
                     *(str(len(point.silent)), first),
@@ -106,7 +106,8 @@ def _lines(study: Study) -> list[list[str]]:
     return rows
 
 
-def _number(value: float | None) -> str:
+def number_text(value: float | None) -> str:
+    """Two digits after the point, or a dash where there is no finite number."""
     return "–" if value is None or not math.isfinite(value) else f"{value:.2f}"
 
 
@@ -131,13 +132,13 @@ def training_markdown(rows: Sequence[ResultRow], axes: Mapping[str, DictConfig])
             [
                 stress.name if stress is not None else axis,
                 severity_text(stress, severity) if stress is not None else "–",
-                _number(psnr),
+                number_text(psnr),
                 "–" if psnr is None or clean is None else f"{psnr - clean:+.2f}",
                 *(
-                    _number(_mean([getattr(row, key) for row in own]))
+                    number_text(_mean([getattr(row, key) for row in own]))
                     for key in ("loss_spikes", "nonfinite_grad_steps")
                 ),
-                _number(_mean([row.grad_norm_p99 for row in own])),
+                number_text(_mean([row.grad_norm_p99 for row in own])),
                 recovered,
                 f"{sum(row.status == 'ok' for row in own)} of {len(own)}",
             ]

@@ -129,7 +129,13 @@ def test_a_training_run_leaves_a_row_of_how_it_went(data, tmp_path):
     run_training(data, tmp_path / "run", "trainer.max_steps=3", "validation_every=3", *words)
     (row,) = read_rows(tmp_path / "results.jsonl")
     assert (row.stress, row.severity, row.status, row.strategy) == (stress, severity, "ok", "training")
-    assert row.psnr > 0 and row.nonfinite_grad_steps == 0 and row.grad_norm_p99 > 0 and row.dataset.endswith("/val")
+    assert (
+        row.psnr > 0
+        and row.held_out_loss > 0
+        and row.nonfinite_grad_steps == 0
+        and row.grad_norm_p99 > 0
+        and row.dataset.endswith("/val")
+    )
 
 
 def test_a_training_run_that_fails_is_a_row(data, tmp_path):

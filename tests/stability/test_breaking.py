@@ -1,6 +1,7 @@
 """Breaking points of curves whose answer is known."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -183,6 +184,20 @@ def test_rows_of_a_sweep_give_the_verdicts_that_they_are_made_for(sweep):
     assert by["none"].area == 1.0 and by["ngd"].area > 1.2
 
 
+def test_seeds_in_folders_of_their_own_are_one_study(tmp_path):
+    runs = []
+    for seed in (0, 1):
+        home = tmp_path / str(seed)
+        for severity in (None, 1.5):
+            own = {"stress": "focal", "severity": severity, "neutral": 1.0} if severity else {}
+            write_run(home, "none", 20.0 - seed if severity is None else 15.0, seed=seed, **own)
+        rows = read_runs(home / "results.jsonl")
+        runs += [replace(r, row=replace(r.row, overrides=[*r.row.overrides, f"paths.runs_dir={home}"])) for r in rows]
+    (study,) = studies(runs, stress_files(), RULES, BOOTSTRAP)
+    (point,) = study.verdicts[0].points
+    assert (study.settings, point.total, point.loss.mean) == (("ckpt=demo",), 4, pytest.approx(4.5))
+
+
 def test_silent_failures_are_listed_with_their_rules_and_what_the_stress_adds(sweep):
     (study,) = studies(sweep, stress_files(), RULES, BOOTSTRAP)
     found = silent_failures(study)
@@ -236,10 +251,11 @@ def test_runs_of_training_are_a_table_with_those_that_did_not_end():
         return ResultRow(run_id="r", time=TIME, stress=stress, severity=severity, **more)
 
     rows = [
-        row(psnr=20.0, loss_spikes=0, nonfinite_grad_steps=0, grad_norm_p99=1.5),
+        row(psnr=20.1, held_out_loss=0.01, loss_spikes=0, nonfinite_grad_steps=0, grad_norm_p99=1.5),
+        row(psnr=19.9, held_out_loss=0.02, loss_spikes=0, nonfinite_grad_steps=0, grad_norm_p99=1.5),
         row("train_lr", 30.0, psnr=15.0, loss_spikes=4, nonfinite_grad_steps=2, grad_norm_p99=9.0),
         row("train_lr", 30.0, status="diverged", error="gradients", loss_spikes=6, nonfinite_grad_steps=20),
     ]
     text = training_markdown(rows, stress_files())
-    assert "| none | – | 20.00 | +0.00 | 0.00 | 0.00 | 1.50 | – | 1 of 1 |" in text
-    assert "| learning rate | ×30 | 15.00 | -5.00 | 5.00 | 11.00 | 9.00 | 1 of 2 | 1 of 2 |" in text
+    assert "| none | – | 20.00 ± 0.14 | +0.00 | 0.0150 ± 0.0071 | 0.00 | 0.00 | 1.50 | – | 2 of 2 |" in text
+    assert "| learning rate | ×30 | 15.00 | -5.00 | – | 5.00 | 11.00 | 9.00 | 1 of 2 | 1 of 2 |" in text

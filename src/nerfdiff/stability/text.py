@@ -111,14 +111,17 @@ def number_text(value: float | None) -> str:
     return "–" if value is None or not math.isfinite(value) else f"{value:.2f}"
 
 
+COUNTS = ("loss_spikes", "nonfinite_grad_steps", "grad_norm_p99")
+
+
 def training_markdown(rows: Sequence[ResultRow], axes: Mapping[str, DictConfig]) -> str:
     """A line per stress of training and severity: means over seeds, and how many runs did not end."""
     groups: dict[tuple[str, float | None], list[ResultRow]] = {}
     for row in rows:
         groups.setdefault((row.stress or "none", row.severity), []).append(row)
     table = [
-        ["stress", "severity", "held-out PSNR, dB", "against clean", "spikes", "steps without a gradient"]
-        + ["99 % of gradient norms", "recovered", "runs that ended"]
+        ["stress", "severity", "held-out PSNR, dB", "against clean", "CDM's held-out loss", "spikes"]
+        + ["steps without a gradient", "99 % of gradient norms", "recovered", "runs that ended"]
     ]
     clean = _mean([row.psnr for row in groups.get(("none", None), ())])
     for (axis, severity), own in sorted(
@@ -132,25 +135,27 @@ def training_markdown(rows: Sequence[ResultRow], axes: Mapping[str, DictConfig])
             [
                 stress.name if stress is not None else axis,
                 severity_text(stress, severity) if stress is not None else "–",
-                number_text(psnr),
+                _with_spread([row.psnr for row in own]),
                 "–" if psnr is None or clean is None else f"{psnr - clean:+.2f}",
-                *(
-                    number_text(_mean([getattr(row, key) for row in own]))
-                    for key in ("loss_spikes", "nonfinite_grad_steps")
-                ),
-                number_text(_mean([row.grad_norm_p99 for row in own])),
+                _with_spread([row.held_out_loss for row in own], 4),
+                *(number_text(_mean([getattr(row, key) for row in own])) for key in COUNTS),
                 recovered,
                 f"{sum(row.status == 'ok' for row in own)} of {len(own)}",
             ]
         )
     said = (
-        "Means over seeds of runs that ended. A run has recovered if it had spikes or steps without a gradient, and "
-        "ended with its losses finite."
+        "Means over seeds, ± their standard deviation where there are several. A run has recovered if it had spikes or "
+        "steps without a gradient, and ended."
     )
     return f"# Stability of training\n\n{said}\n\n{markdown_lines(table)}"
 
 
-COUNTS = ("loss_spikes", "nonfinite_grad_steps", "grad_norm_p99")
+def _with_spread(values: Sequence[float | None], digits: int = 2) -> str:
+    known = [value for value in values if value is not None and math.isfinite(value)]
+    if not known:
+        return "–"
+    spread = f" ± {np.std(known, ddof=1):.{digits}f}" if len(known) > 1 else ""
+    return f"{np.mean(known):.{digits}f}{spread}"
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

@@ -15,7 +15,7 @@ from nerfdiff.utils.errors import TrainingDiverged, is_out_of_memory
 
 
 def append_training_row(cfg: DictConfig, trainer: Trainer | None, error: Exception | None) -> ResultRow:
-    """Append the row of a run to `cfg.results`; `psnr` is the last held-out one of renderings.
+    """Append the row of a run to `cfg.results`. Held-out numbers are the last: of renderings, and the CDM's loss.
 
     Args:
         cfg: with the settings of its stress.
@@ -24,7 +24,8 @@ def append_training_row(cfg: DictConfig, trainer: Trainer | None, error: Excepti
     """
     guard = next((c for c in trainer.callbacks if isinstance(c, NonFiniteGuard)), None) if trainer is not None else None
     stability: dict[str, Any] = guard.stability.summary() if guard is not None else {}
-    held_out = trainer.callback_metrics.get("val/psnr") if trainer is not None else None
+    held_out = {} if trainer is None else trainer.callback_metrics
+    psnr, loss = (held_out.get(name) for name in ("val/psnr", "val/loss_dm"))
     status = "ok"
     if error is not None:
         status = "diverged" if isinstance(error, TrainingDiverged) else "oom" if is_out_of_memory(error) else "error"
@@ -40,7 +41,8 @@ def append_training_row(cfg: DictConfig, trainer: Trainer | None, error: Excepti
         dataset=f"{cfg.data.name}/{cfg.data.val_split}",
         seed=cfg.seed,
         overrides=None if hydra is None else list(hydra.overrides.task),
-        psnr=None if held_out is None else float(held_out),
+        psnr=None if psnr is None else float(psnr),
+        held_out_loss=None if loss is None else float(loss),
         **row_fields(stress_of(cfg)),
         **environment(device, cfg.trainer.precision),
         **stability,

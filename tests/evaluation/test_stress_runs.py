@@ -20,6 +20,7 @@ from nerfdiff.stability.familiar import Familiar
 from nerfdiff.stability.silent import Silent
 from nerfdiff.stress.axes import stress_files
 from nerfdiff.sweeps.silent_sheet import silent_sheet
+from nerfdiff.training.rows import verdict
 from nerfdiff.utils.errors import ConfigError
 from training_fixtures import evaluation_overrides, run_training
 
@@ -136,6 +137,13 @@ def test_a_training_run_leaves_a_row_of_how_it_went(data, tmp_path):
         and row.grad_norm_p99 > 0
         and row.dataset.endswith("/val")
     )
+
+
+@pytest.mark.parametrize(
+    ("psnr", "said"), [(12.6, "suspect: held-out renderings have 12.6 dB, pictures of one even"), (13.5, "ok")]
+)
+def test_a_training_that_collapsed_is_suspect(psnr, said):
+    assert verdict({"val/psnr": psnr, "val/psnr_even": 13.1}).startswith(said) and verdict({}) is None
 
 
 def test_a_training_run_that_fails_is_a_row(data, tmp_path):

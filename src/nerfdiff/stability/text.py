@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 from nerfdiff.results.row import ResultRow
 from nerfdiff.results.text import markdown_lines, one_line
 from nerfdiff.stability.breaking import Breaking
+from nerfdiff.stability.judge import OK
 from nerfdiff.stability.study import Study, Verdict
 
 RULES = (
@@ -121,7 +122,7 @@ def training_markdown(rows: Sequence[ResultRow], axes: Mapping[str, DictConfig])
         groups.setdefault((row.stress or "none", row.severity), []).append(row)
     table = [
         ["stress", "severity", "held-out PSNR, dB", "against clean", "CDM's held-out loss", "spikes"]
-        + ["steps without a gradient", "99 % of gradient norms", "recovered", "runs that ended"]
+        + ["steps without a gradient", "99 % of gradient norms", "recovered", "suspect", "runs that ended"]
     ]
     clean = _mean([row.psnr for row in groups.get(("none", None), ())])
     for (axis, severity), own in sorted(
@@ -129,7 +130,11 @@ def training_markdown(rows: Sequence[ResultRow], axes: Mapping[str, DictConfig])
     ):
         psnr = _mean([row.psnr for row in own])
         upset = [row for row in own if row.loss_spikes or row.nonfinite_grad_steps]
-        recovered = f"{sum(row.status == 'ok' for row in upset)} of {len(upset)}" if upset else "–"
+        recovered = (
+            f"{sum(row.status == 'ok' and (row.verdict or OK) == OK for row in upset)} of {len(upset)}"
+            if upset
+            else "–"
+        )
         stress = axes.get(axis)
         table.append(
             [
@@ -140,12 +145,14 @@ def training_markdown(rows: Sequence[ResultRow], axes: Mapping[str, DictConfig])
                 _with_spread([row.held_out_loss for row in own], 4),
                 *(number_text(_mean([getattr(row, key) for row in own])) for key in COUNTS),
                 recovered,
+                f"{sum((row.verdict or OK) != OK for row in own)} of {len(own)}",
                 f"{sum(row.status == 'ok' for row in own)} of {len(own)}",
             ]
         )
     said = (
-        "Means over seeds, ± their standard deviation where there are several. A run has recovered if it had spikes or "
-        "steps without a gradient, and ended."
+        "Means over seeds, ± their standard deviation where there are several. A run is suspect if its held-out renderings "
+        "are no better than pictures of one even colour. It has recovered if it had spikes or steps without a gradient, "
+        "ended, and is not suspect."
     )
     return f"# Stability of training\n\n{said}\n\n{markdown_lines(table)}"
 

@@ -150,9 +150,9 @@ def training_markdown(rows: Sequence[ResultRow], axes: Mapping[str, DictConfig])
             ]
         )
     said = (
-        "Means over seeds, ± their standard deviation where there are several. A run is suspect if its held-out renderings "
-        "are no better than pictures of one even colour. It has recovered if it had spikes or steps without a gradient, "
-        "ended, and is not suspect."
+        "Means over seeds, ± their standard deviation where there are several. A run is suspect if its held-out "
+        "renderings are no better than pictures of one even colour. It has recovered if it had spikes or steps without "
+        "a gradient, ended, and is not suspect."
     )
     return f"# Stability of training\n\n{said}\n\n{markdown_lines(table)}"
 

@@ -26,6 +26,8 @@ from nerfdiff.stability.breaking import (
 log = logging.getLogger(__name__)
 
 SWEPT = ("stress", "stress.severity", "strategy", "seed")
+PLACES = ("paths.runs_dir", "paths.output_dir", "run_name", "results", "threads", "data.cache_dir", "data.num_workers")
+"""Overrides that say where runs were made, and not what."""
 BASELINES = ("copy_input", "mean_image")
 CLEAN = "none"
 
@@ -54,7 +56,7 @@ class Verdict:
 
     @property
     def broken(self) -> int:
-        return sum(len(point.broken_scenes) for point in self.points)
+        return sum(len(point.failures) for point in self.points)
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ class Study:
 
 
 def studies(runs: Iterable[Run], axes: Mapping[str, DictConfig], rules: Rules, bootstrap: Bootstrap) -> list[Study]:
-    """Judge the runs of sweeps of stresses; others are left out.
+    """Judge the runs of sweeps of stresses, which may lie in several folders, as one seed each; others are left out.
 
     Args:
         runs: oldest first; the newest of the same job counts.
@@ -92,7 +94,8 @@ def studies(runs: Iterable[Run], axes: Mapping[str, DictConfig], rules: Rules, b
     """
     jobs: dict[tuple, dict[tuple, Run]] = {}
     for run in runs:
-        rest = tuple(sorted(w for w in run.row.overrides or () if w.lstrip("+").partition("=")[0] not in SWEPT))
+        words = run.row.overrides or ()
+        rest = tuple(sorted(w for w in words if w.lstrip("+").partition("=")[0] not in (*SWEPT, *PLACES)))
         key = run.row.stress, run.row.severity, run.row.strategy, run.row.seed
         jobs.setdefault(rest, {})[key] = run
     found = [_study(settings, list(own.values()), axes, rules, bootstrap) for settings, own in jobs.items()]
@@ -127,6 +130,7 @@ def _study(
                     own if others else baseline,
                     _frechet(by_point[axis, severity, strategy]),
                     [] if others else _frechet(clean_runs.get(strategy, ())),
+                    {} if others or strategy == "none" else clean.get("none", {}),
                 )
     points = {
         key: {severity: point_of(each, rules, bootstrap) for severity, each in own.items()}

@@ -81,6 +81,12 @@ class Study:
         return sum(verdict.silent for verdict in self.verdicts)
 
     @property
+    def silent_lost(self) -> int:
+        """Silent failures of rule b; the others are of rule c alone."""
+        points = (point for verdict in self.verdicts for point in verdict.points)
+        return sum("b" in failure.rules for point in points for failure in point.silent)
+
+    @property
     def broken(self) -> int:
         return sum(verdict.broken for verdict in self.verdicts)
 

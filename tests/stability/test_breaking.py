@@ -198,6 +198,17 @@ def test_seeds_in_folders_of_their_own_are_one_study(tmp_path):
     assert (study.settings, point.total, point.loss.mean) == (("ckpt=demo",), 4, pytest.approx(4.5))
 
 
+def test_another_seed_as_a_stress_is_compared_with_the_seed_that_was_asked_for(tmp_path):
+    """The run with seed 0 and stress=seed has a row of seed 1: it is not the clean run of seed 1."""
+    for seed, psnr in ((0, 20.0), (1, 18.0)):
+        write_run(tmp_path, "ngd", psnr, seed=seed)
+    write_run(tmp_path, "ngd", 18.0, "seed", 1.0, seed=0)
+    runs = read_runs(tmp_path / "results.jsonl")
+    runs[-1] = replace(runs[-1], row=replace(runs[-1].row, seed=1))
+    (study,) = studies(runs, stress_files(), RULES, BOOTSTRAP)
+    assert study.verdicts[0].points[0].loss.mean == pytest.approx(2.0)
+
+
 def test_silent_failures_are_listed_with_their_rules_and_what_the_stress_adds(sweep):
     (study,) = studies(sweep, stress_files(), RULES, BOOTSTRAP)
     found = silent_failures(study)

@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 from nerfdiff.results.frame import Run
 from nerfdiff.results.text import markdown_lines
 from nerfdiff.stability.breaking import Failure, Rules
-from nerfdiff.stability.study import Study
+from nerfdiff.stability.study import Study, seed_of
 from nerfdiff.stability.text import number_text, severity_text
 
 COLUMNS = ("axis", "severity", "strategy", "seed", "scene", "rules", "loss", "harm", "clean_harm")
@@ -52,7 +52,7 @@ def silent_failures(study: Study) -> list[Silent]:
     found = []
     for verdict in study.verdicts:
         for point, runs in zip(verdict.points, verdict.runs, strict=True):
-            by_seed = {run.row.seed or 0: run for run in runs}
+            by_seed = {seed_of(run): run for run in runs}
             stress = study.axes[verdict.axis]
             found += [
                 Silent(stress, point.severity, verdict.strategy, failure, by_seed.get(failure.seed))

@@ -81,8 +81,20 @@ class Study:
         return sum(verdict.silent for verdict in self.verdicts)
 
     @property
+    def silent_lost(self) -> int:
+        """Silent failures of rule b; the others are of rule c alone."""
+        points = (point for verdict in self.verdicts for point in verdict.points)
+        return sum("b" in failure.rules for point in points for failure in point.silent)
+
+    @property
     def broken(self) -> int:
         return sum(verdict.broken for verdict in self.verdicts)
+
+
+def seed_of(run: Run) -> int:
+    """Return the seed that a run was asked for: the stress `seed` gives it another."""
+    asked = [word.partition("=")[2] for word in run.row.overrides or () if word.startswith("seed=")]
+    return int(asked[-1]) if asked and asked[-1].isdecimal() else run.row.seed or 0
 
 
 def studies(runs: Iterable[Run], axes: Mapping[str, DictConfig], rules: Rules, bootstrap: Bootstrap) -> list[Study]:
@@ -96,7 +108,7 @@ def studies(runs: Iterable[Run], axes: Mapping[str, DictConfig], rules: Rules, b
     for run in runs:
         words = run.row.overrides or ()
         rest = tuple(sorted(w for w in words if w.lstrip("+").partition("=")[0] not in (*SWEPT, *PLACES)))
-        key = run.row.stress, run.row.severity, run.row.strategy, run.row.seed
+        key = run.row.stress, run.row.severity, run.row.strategy, seed_of(run)
         jobs.setdefault(rest, {})[key] = run
     found = [_study(settings, list(own.values()), axes, rules, bootstrap) for settings, own in jobs.items()]
     return [study for study in found if study.verdicts]
@@ -205,7 +217,7 @@ def _outcomes(runs: Sequence[Run], scenes: Sequence[str]) -> Outcomes:
         if not own:
             status = run.row.status if run.row.status not in ("ok", None) else "error"
             own = {scene: Outcome(math.nan, status) for scene in scenes or ("?",)}
-        found |= {(run.row.seed or 0, scene): outcome for scene, outcome in own.items()}
+        found |= {(seed_of(run), scene): outcome for scene, outcome in own.items()}
     return found
 
 

@@ -84,7 +84,7 @@ def test_pictures_of_one_name_get_folders_of_their_own(tmp_path):
 
 def test_a_box_is_taken_before_white_too_and_not_beside_a_mask(tmp_path, caplog):
     wagon = str(ASSETS / "pictures" / "wagon.png")
-    words = [f"images=['{wagon}']", "strategy=none", "format=[]", "box=[10,30,118,100]"]
+    words = [f"images=['{wagon}']", "strategy=none", "format=[png]", "box=[10,30,118,100]"]
     (folder,) = made(tmp_path, *words)
     assert (folder / "mask.png").exists() and "wagon.png: the object was cut out" in caplog.text
     assert not np.asarray(Image.open(folder / "mask.png"))[:30].any()

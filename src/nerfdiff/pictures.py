@@ -106,7 +106,7 @@ def _make(cfg: DictConfig, model: Model, image: Path, folder: Path) -> None:
         written += export.write(folder, name, [kind])
     print(*written, sep="\n")
     if scene.verdict != OK:
-        print(f"{scene.verdict} (docs/pictures.md#suspect)")
+        print(f"{scene.verdict} (docs/pictures.md#suspect-scenes)")
     more = " ".join([*command_words("export"), f"field={folder / FIELD}", "format=gif,png"])
     print(f"next: look at {written[0]}; for other files: {more}")
 

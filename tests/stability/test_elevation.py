@@ -1,5 +1,7 @@
 """Elevations are estimated from features, and how well is measured on images that the estimate has not seen."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -19,10 +21,10 @@ def images():
 def test_elevations_are_estimated_better_than_by_their_median(images):
     found, degrees = images
     fit = Elevation.of(found, degrees)
-    missed = (fit(found[1::2]) - degrees[1::2]).abs()
-    assert fit.error == pytest.approx(float(missed.mean())) and fit.error < 4 < 10 < fit.spread and fit.useful
-    assert (missed <= fit.most).float().mean() == pytest.approx(0.9, abs=0.02)
-    assert (fit.low, fit.high) == (float(degrees[::2].min()), float(degrees[::2].max()))
+    missed = (Elevation.of(found[:300], degrees[:300])(found[300:]) - degrees[300:]).abs()
+    assert fit.error == pytest.approx(float(missed.mean()), rel=0.3) and fit.error < 4 < 10 < fit.spread and fit.useful
+    assert (missed <= fit.most).float().mean() == pytest.approx(0.9, abs=0.08)
+    assert (fit.low, fit.high) == (float(degrees.min()), float(degrees.max()))
     assert float(fit(100 * found).max()) == fit.high  # what no training image has is not said
 
 
@@ -37,10 +39,11 @@ def test_it_is_kept_with_what_is_familiar_and_images_of_unknown_elevation_are_le
     known = torch.randn(400, 17, generator=torch.Generator().manual_seed(1))
     some = degrees.clone()
     some[::4] = torch.nan
-    familiar = Familiar.of(found, 8, known, some)
+    familiar = replace(Familiar.of(found, 8, known), elevation=Elevation.of(found, some))
     familiar.save(tmp_path / "familiar.safetensors")
     loaded = Familiar.load(tmp_path / "familiar.safetensors")
     assert torch.equal(loaded.elevation(found), familiar.elevation(found)) and loaded.elevation.error < 5
     assert loaded.elevation.most == familiar.elevation.most
-    for unknown in (None, torch.full_like(degrees, torch.nan)):
-        assert Familiar.of(found, 8, known, unknown).elevation is None
+    assert Elevation.of(found, torch.full_like(degrees, torch.nan)) is None
+    replace(familiar, elevation=None).save(tmp_path / "familiar.safetensors")
+    assert Familiar.load(tmp_path / "familiar.safetensors").elevation is None

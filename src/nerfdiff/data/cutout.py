@@ -154,7 +154,7 @@ class CutOut:
         """Where the object is, and what speaks against it."""
         doubts = []
         if within is not None:
-            found = self._fine(pixels, self._closer(pixels, within, 0.2)) & within
+            found = self._fine(pixels, self._closer(pixels, within, 1.0)) & within
         else:
             first = self._best(pixels)
             doubts = first.doubts(self)
@@ -163,7 +163,7 @@ class CutOut:
             found = self._fine(pixels, first.share)
         if found.any():
             window = _around(found)
-            closer = self._fine(pixels[window], self._closer(pixels[window], found[window], 1.5))
+            closer = self._fine(pixels[window], self._closer(pixels[window], found[window], 0.0))
             if closer.sum() > found.sum() / 2:
                 found = np.zeros_like(found)
                 found[window] = closer
@@ -172,17 +172,17 @@ class CutOut:
     def _fine(self, pixels, share) -> Bool[np.ndarray, "height width"]:
         return _main_part(_refined(pixels, share, self.fine))
 
-    def _closer(self, pixels, found, most: float) -> Float[np.ndarray, "rows columns"]:
+    def _closer(self, pixels, found, margin: float) -> Float[np.ndarray, "rows columns"]:
         """Share of the object in each pixel, which lies within, or near, the hull of `found`.
 
         Args:
-            most: log-odds of the object deep within the hull.
+            margin: how deep within the hull the object is as likely as not, in tenths of its size.
         """
         lab = self._lab(pixels)
         hull = convex_hull_image(np.asarray(Image.fromarray(found).resize(lab.shape[1::-1])))
         reach = 0.1 * np.sqrt(hull.sum())
         inside, outside = (ndimage.distance_transform_edt(part) / reach for part in (hull, ~hull))
-        enclosed = (inside.clip(0, most) - outside.clip(0, 4)).ravel()
+        enclosed = (np.where(hull, (inside - margin).clip(-1, 1.5), 0) - outside.clip(0, 4)).ravel()
         return self._cut(_Walk(lab, self.smooth, 0.0), lab, enclosed, np.zeros(hull.shape, bool))
 
     def _lab(self, pixels) -> Float[np.ndarray, "rows columns 3"]:

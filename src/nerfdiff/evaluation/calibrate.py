@@ -1,6 +1,7 @@
 """Calibration: what the metrics say of failures, what a model's training images look like, and the judge's limits."""
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -15,6 +16,7 @@ from nerfdiff.data.batch import Sample, ViewBatch
 from nerfdiff.data.scene import Listing
 from nerfdiff.evaluation.controls import controls, controls_markdown
 from nerfdiff.results.frame import find_results, read_runs
+from nerfdiff.stability.elevation import Elevation, framed
 from nerfdiff.stability.familiar import FAMILIAR, Familiar, measured
 from nerfdiff.stability.limits import fit_limits, halves, limits_text, samples_of
 from nerfdiff.trajectories import Upright
@@ -62,8 +64,11 @@ def _familiar(cfg: DictConfig) -> None:
             degrees.append(_elevations(reader.listing(index))[view])
             yield ViewBatch.collate([Sample(reader.load(index, [view]), source=0, targets=[0], draw=number)])
 
-    found, known = measured(loaded.model, batches())
-    familiar = Familiar.of(found, cfg.kept, known, torch.stack(degrees))
+    seen = list(batches())
+    found, known = measured(loaded.model, seen)
+    familiar = Familiar.of(found, cfg.kept, known)
+    shown, _ = measured(loaded.model, (framed(batch, familiar.framing()) for batch in seen))
+    familiar = replace(familiar, elevation=Elevation.of(shown, torch.stack(degrees)))
     if (elevation := familiar.elevation) is not None:
         log.info(
             "elevations of training images held out are missed by %.1f degrees on average, 9 of 10 by at most %.1f; "

@@ -23,6 +23,7 @@ from nerfdiff.distill.strategy import Strategy
 from nerfdiff.exported_model import LoadedModel
 from nerfdiff.model import NerfDiff
 from nerfdiff.results.environment import hardware
+from nerfdiff.stability.elevation import framed
 from nerfdiff.stability.familiar import Familiar, features
 from nerfdiff.stability.judge import Judge
 from nerfdiff.stability.mend import mend_of
@@ -317,7 +318,7 @@ def _elevation(cfg: DictConfig, loaded: LoadedModel, scene: ViewBatch) -> float:
     key = "elevation" if "elevation" in cfg else "picture_views.source_elevation"
     familiar = Familiar.beside(loaded.path)
     fit = None if familiar is None else familiar.elevation
-    if fit is None or not fit.useful:
+    if fit is None or not fit.useful or familiar.framing() is None:
         log.warning(
             "%s cannot estimate elevations (docs/stability.md: part=familiar): %s is taken to look down from %g "
             "degrees at its object; say %s=… if that is wrong",
@@ -329,7 +330,8 @@ def _elevation(cfg: DictConfig, loaded: LoadedModel, scene: ViewBatch) -> float:
         return float(cfg.usual_elevation)
     with torch.no_grad():
         own = next(loaded.model.parameters()).device
-        found = round(float(fit(features(loaded.model.encode(scene.to(own))))[0]), 1)
+        shown = framed(scene, familiar.framing()).to(own)
+        found = round(float(fit(features(loaded.model.encode(shown)))[0]), 1)
     log.info(
         "%s is estimated to look down from %g degrees at its object (of training images 9 of 10 are missed by at most "
         "%.0f); say %s=… if that is wrong",

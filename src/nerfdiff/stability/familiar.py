@@ -46,7 +46,7 @@ class Familiar:
         rest: root mean square of what the axes leave, over dimensions and images.
         usual: distance that 99 % of images held out from the axes do not exceed.
         ranges: lower end, median and upper end of the training inputs' facts; None in files from before there were any.
-        elevation: estimates a picture's from its features; None where it is not known, or was not when this was made.
+        elevation: estimates a framed picture's from its features; None where it is not known, or was not then.
     """
 
     mean: Float[Tensor, "dim"]
@@ -58,19 +58,13 @@ class Familiar:
     elevation: Elevation | None = None
 
     @staticmethod
-    def of(
-        found: Float[Tensor, "images dim"],
-        kept: int,
-        known: Float[Tensor, "images facts"],
-        degrees: Float[Tensor, "images"] | None = None,
-    ) -> "Familiar":
+    def of(found: Float[Tensor, "images dim"], kept: int, known: Float[Tensor, "images facts"]) -> "Familiar":
         """Take axes from every other image, the usual distance from the others, and ranges from all.
 
         Args:
             found: the images' features.
             kept: axes at most.
             known: the images' facts.
-            degrees: the images' elevations; None: not known.
         """
         fitted, held_out = found[::2].double(), found[1::2]
         mean = fitted.mean(0)
@@ -81,8 +75,7 @@ class Familiar:
         parts = (mean.float(), axes.float().contiguous(), spread.float())
         unscaled = Familiar(*parts, rest=float(left.square().mean().sqrt()), usual=1.0)
         usual = float(torch.quantile(unscaled.distance(held_out), QUANTILE))
-        elevation = None if degrees is None else Elevation.of(found, degrees)
-        return Familiar(*parts, rest=unscaled.rest, usual=usual, ranges=usual_range(known), elevation=elevation)
+        return Familiar(*parts, rest=unscaled.rest, usual=usual, ranges=usual_range(known))
 
     def distance(self, found: Float[Tensor, "images dim"]) -> Float[Tensor, "images"]:
         """Return distances, 1 being as far as the 99th of 100 training images: along the axes and beside them."""

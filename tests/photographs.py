@@ -26,6 +26,19 @@ def noise(size: tuple[int, int], seed: int, roughness: float = 1.6) -> np.ndarra
     return (np.asarray(image) / 255 + grain).clip(0, 1)
 
 
+def bricks(size: tuple[int, int], seed: int) -> np.ndarray:
+    """A wall whose bricks have edges as an object has, above grey ground [height, width, 3]."""
+    generator, (height, width) = np.random.default_rng(seed), size
+    tall, long = height // 24, width // 12
+    row, column = np.arange(height)[:, None] // tall, np.arange(width)[None]
+    column = column + long // 2 * (row % 2)
+    tint = generator.uniform(0.75, 1.15, (height // tall + 1, width // long + 2))[row, column // long][..., None]
+    mortar = (np.arange(height)[:, None] % tall < tall // 5) | (column % long < long // 10)
+    wall = np.where(mortar[..., None], 0.68, tint * [0.59, 0.31, 0.24])
+    wall = np.where((np.arange(height)[:, None] > 0.55 * height)[..., None], 0.5, wall)
+    return (wall + generator.normal(0, 0.02, (*size, 1))).clip(0, 1)
+
+
 def photograph(
     model: np.ndarray,
     where: np.ndarray,
@@ -34,6 +47,7 @@ def photograph(
     centre: tuple[float, float],
     share: float,
     seed: int,
+    behind: np.ndarray | None = None,
 ) -> np.ndarray:
     """Write a JPEG of a model before a background, and return its true mask.
 
@@ -42,13 +56,14 @@ def photograph(
         size: (height, width) of the photograph.
         centre: (x, y) of the model, as shares.
         share: of the photograph's height that the model's picture takes.
+        behind: what lies behind; None: noise.
     """
     side = round(share * size[0])
     colours = np.asarray(Image.fromarray(model).resize((side, side), Image.Resampling.BICUBIC)) / 255
     alpha = (
         np.asarray(Image.fromarray((where * 255).astype(np.uint8)).resize((side, side), Image.Resampling.BICUBIC)) / 255
     )
-    picture, mask = noise(size, seed), np.zeros(size, bool)
+    picture, mask = noise(size, seed) if behind is None else behind, np.zeros(size, bool)
     top, left = round(centre[1] * size[0] - side / 2), round(centre[0] * size[1] - side / 2)
     part = (slice(top, top + side), slice(left, left + side))
     picture[part] = alpha[..., None] * colours + (1 - alpha[..., None]) * picture[part]

@@ -10,11 +10,15 @@ from PIL import Image
 import nerfdiff
 from nerfdiff.api import _of_picture
 from nerfdiff.cli import load_config
+from nerfdiff.distill.priors import all_cameras
+from nerfdiff.evaluation.run import picture_scene
 from nerfdiff.exports.views import render_rgba
 from nerfdiff.inputs import ASSETS
+from nerfdiff.trajectories import Upright
 from nerfdiff.utils.errors import ConfigError, DataError
 
 WAGON = ASSETS / "pictures" / "wagon.png"
+WAGON_ELEVATION = 23  # of its camera, in degrees
 SMALL = ["budget.steps=1", "budget.sampler_steps=1", "budget.inner_steps=1", "budget.rays=64", "budget.views=2"]
 
 
@@ -35,6 +39,7 @@ def test_a_scene_shows_the_picture_and_its_other_sides(scene):
     shown = pixels[..., :3] * pixels[..., 3:] + 1 - pixels[..., 3:]
     assert np.abs(shown - np.asarray(scene.picture) / 255).mean() < 0.03
     assert np.asarray(back)[..., 3].max() > 200
+    assert scene.verdict == "ok" or scene.verdict.startswith("suspect: ")
 
 
 def test_what_is_saved_is_the_scene(scene, tmp_path):
@@ -69,6 +74,25 @@ def test_pictures_are_framed_as_the_models_were(model, tmp_path, caplog):
     unknown = replace(model.loaded, path=tmp_path / "model.safetensors")
     assert _of_picture(load_config("picture", []), WAGON, unknown).picture.object_centre == [0.5, 0.545]
     assert "does not say how its training images were framed" in caplog.text
+
+
+def test_the_elevation_is_estimated_where_the_model_can(model, tmp_path, caplog):
+    caplog.set_level("INFO")
+    cfg = _of_picture(load_config("picture", []), WAGON, model.loaded)
+    scene = picture_scene(cfg, model.loaded, (64, 64))
+    assert cfg.picture_views.source_elevation == pytest.approx(WAGON_ELEVATION, abs=8)
+    assert "is estimated to look down from" in caplog.text and "say elevation=… if that is wrong" in caplog.text
+    up = Upright.seen_by(all_cameras(scene)).up
+    assert torch.rad2deg(torch.atan2(-up[2], -up[1])) == pytest.approx(cfg.picture_views.source_elevation, abs=0.1)
+
+    unknown = replace(model.loaded, path=tmp_path / "model.safetensors")
+    cfg = _of_picture(load_config("picture", []), WAGON, unknown)
+    picture_scene(cfg, unknown, (64, 64))
+    assert cfg.picture_views.source_elevation == cfg.usual_elevation == 20
+    assert "cannot estimate elevations" in caplog.text
+    cfg = _of_picture(load_config("picture", ["elevation=7"]), WAGON, model.loaded)
+    picture_scene(cfg, model.loaded, (64, 64))
+    assert cfg.picture_views.source_elevation == 7
 
 
 def test_what_cannot_be_is_named(model, scene, tmp_path):

@@ -43,7 +43,7 @@ def test_a_photograph_becomes_a_folder(photo, tmp_path, caplog, capsys):
     (car,) = made(tmp_path, f"images=['{photo}']", "elevation=8")
     files = {"field.safetensors", "scene.json", "views.png", "orbit.mp4", "viewer.html", "my_car.glb", "my_car.ply"}
     assert {path.name for path in car.iterdir()} == files | {"mask.png", "cutout.png"}
-    assert "my car.jpg: its background is neither transparent nor white; the object was cut out by its" in caplog.text
+    assert "my car.jpg: the object was cut out by its" in caplog.text
     assert "mask=<image of its size" in caplog.text
     up = load_field(car / "field.safetensors").stands.up
     assert float(np.degrees(np.arctan2(-up[2], -up[1]))) == pytest.approx(8, abs=0.1)
@@ -60,7 +60,9 @@ def test_a_photograph_becomes_a_folder(photo, tmp_path, caplog, capsys):
     mask.save(tmp_path / "own.png")
     made(tmp_path, f"images=['{photo}']", f"mask={tmp_path / 'own.png'}", "elevation=8", "format=[ply]")
     assert (car / "field.safetensors").stat().st_mtime_ns > before
-    assert json.loads((car / "scene.json").read_text())["picture"] == str(photo)
+    facts = json.loads((car / "scene.json").read_text())
+    assert facts["picture"] == str(photo) and facts["verdict"].startswith("suspect: ")  # one step makes no scene
+    assert facts["verdict"] in capsys.readouterr().out
 
 
 def test_a_picture_that_fails_leaves_the_others(tmp_path, caplog):
@@ -80,11 +82,22 @@ def test_pictures_of_one_name_get_folders_of_their_own(tmp_path):
     assert [path.name for path in found] == ["car", "car_2", "van", "car_3"]
 
 
+def test_a_box_is_taken_before_white_too_and_not_beside_a_mask(tmp_path, caplog):
+    wagon = str(ASSETS / "pictures" / "wagon.png")
+    words = [f"images=['{wagon}']", "strategy=none", "format=[png]", "box=[10,30,118,100]"]
+    (folder,) = made(tmp_path, *words)
+    assert (folder / "mask.png").exists() and "wagon.png: the object was cut out" in caplog.text
+    assert not np.asarray(Image.open(folder / "mask.png"))[:30].any()
+    with pytest.raises(DataError, match="both say where the object is"):
+        made(tmp_path, *words, f"mask={wagon}")
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         ([], "name a picture: "),
         (["images=[a.png,b.png]", "mask=m.png"], "mask=m.png is of one picture, and there are 2"),
+        (["images=[a.png,b.png]", "box=[1,2,30,40]"], "box=.* is of one picture, and there are 2"),
         (["images=[a.png]", "format=[stl]"], "'stl'.*glb"),
     ],
 )

@@ -36,6 +36,7 @@ from nerfdiff.exports.views import render_rgba, to_image
 from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.fit.saved_field import SavedField, load_field, save_field
 from nerfdiff.stability.familiar import Familiar
+from nerfdiff.stability.judge import OK
 from nerfdiff.stability.mend import mend_of
 from nerfdiff.trajectories import Upright
 from nerfdiff.utils.config import auto_precision, plain
@@ -86,6 +87,7 @@ class Model:
         budget: str = "minutes",
         elevation: float | None = None,
         mask: str | Path | None = None,
+        box: Sequence[float] | None = None,
         seed: int = 0,
         settings: Sequence[str] = (),
     ) -> "Scene":
@@ -96,8 +98,9 @@ class Model:
                 log line says (`Scene.mask`).
             strategy: `ngd_current`, `ngd`, `direct`, `sds`, `stochastic` or `none`.
             budget: how much it may compute: `minutes` or `paper`.
-            elevation: degrees from which the picture looks down at the object; None: 20, which a log line says.
+            elevation: degrees from which the picture looks down at the object; None: estimated, which a log line says.
             mask: file of the picture's size, white where the object is.
+            box: [left, top, right, bottom] in pixels, in which the object lies.
             seed: of all noise.
             settings: more of `conf/picture.yaml`, as on the command line: `["budget.steps=32"]`.
 
@@ -108,6 +111,7 @@ class Model:
         words = [f"ckpt={self.loaded.path}", f"strategy={strategy}", f"budget={budget}", f"seed={seed}"]
         words += [] if elevation is None else [f"elevation={float(elevation)}"]
         words += [] if mask is None else [f"mask={mask}"]
+        words += [] if box is None else [f"box={list(box)}"]
         return self.distil_batch(*self.prepare(load_config("picture", [*words, *settings]), picture))
 
     def prepare(self, cfg: DictConfig, picture: str | Path) -> tuple[DictConfig, ViewBatch, Mask | None]:
@@ -125,20 +129,12 @@ class Model:
         cfg, size = _of_picture(cfg, picture, self.loaded), self.loaded.image_size or plain(cfg.picture_size)
         if size is None:
             raise ConfigError(f"{self.loaded.path} does not say its image size: give picture_size=[height,width]")
-        mask = None
+        mask = _cut_out(cfg, picture) if cfg.cutout.box is not None else None
         try:
-            scene = picture_scene(cfg, size)
+            scene = picture_scene(cfg, self.loaded, size, mask and mask.where)
         except BackgroundError:
-            mask = instantiate(cfg.cutout).find(picture)
-            doubts = "".join(f"; {doubt}" for doubt in mask.doubts)
-            log.warning(
-                "%s: its background is neither transparent nor white; the object was cut out %s%s. Look at the mask; "
-                "mask=<image of its size, white where the object is> gives a better one",
-                picture,
-                mask.how,
-                doubts,
-            )
-            scene = picture_scene(cfg, size, mask.where)
+            mask = _cut_out(cfg, picture)
+            scene = picture_scene(cfg, self.loaded, size, mask.where)
         if (mend := mend_of(cfg, Familiar.beside(self.loaded.path))) is not None:
             scene = mend(scene)
         return cfg, scene.to(self.device), mask
@@ -154,10 +150,31 @@ class Model:
             raise ConfigError(f"strategy={strategy.name} leaves no scene: choose one that does, as ngd_current")
         if views.status != "ok":
             log.warning("the fit was %s: this is the last field before that", views.status)
+        judge, familiar = instantiate(cfg.judge), Familiar.beside(self.loaded.path)
+        with autocast(self.device, precision):
+            verdict = judge.verdict(judge.signs(self.loaded.model, batch, views, familiar, cfg.seed), views.status)
+        if verdict != OK:
+            log.warning("the scene of %s is %s", batch.scene_ids[0], verdict)
         stands = Upright.seen_by(all_cameras(batch)).to("cpu")
         picture = Image.fromarray(batch.source_pixels[0].permute(1, 2, 0).cpu().numpy())
         steps = kept.fields[0] if kept.fields else {}
-        return Scene(replace(views.field, stands=stands), picture, mask, views.status, steps)
+        return Scene(replace(views.field, stands=stands), picture, mask, views.status, verdict, steps)
+
+
+def _cut_out(cfg: DictConfig, picture: str | Path) -> Mask:
+    """Find the object of a picture whose background is neither transparent nor white, or in a box of it."""
+    if cfg.mask is not None:
+        raise ConfigError(f"box={list(cfg.cutout.box)} and mask={cfg.mask} both say where the object is: give one")
+    mask = instantiate(cfg.cutout).find(picture)
+    doubts = "".join(f"; {doubt}" for doubt in mask.doubts)
+    log.warning(
+        "%s: the object was cut out %s%s. Look at the mask; box=[left,top,right,bottom] in pixels, or mask=<image of "
+        "its size, white where the object is>, gives a better one",
+        picture,
+        mask.how,
+        doubts,
+    )
+    return mask
 
 
 def _of_picture(cfg: DictConfig, picture: str | Path, loaded: LoadedModel) -> DictConfig:
@@ -168,12 +185,6 @@ def _of_picture(cfg: DictConfig, picture: str | Path, loaded: LoadedModel) -> Di
         cfg.picture.mask = cfg.mask
     if cfg.elevation is not None:
         cfg.picture_views.source_elevation = cfg.elevation
-    else:
-        log.info(
-            "%s is taken to look down from %g degrees at its object; say elevation=… if that is wrong",
-            picture,
-            cfg.picture_views.source_elevation,
-        )
     return framed_as_trained(cfg, loaded)
 
 
@@ -186,6 +197,8 @@ class Scene:
         picture: as the model saw it; None where the scene was read from a file.
         mask: where the object was found, if that had to be.
         status: `ok`, or why the field is not the one that the fit ended with.
+        verdict: `ok`, or `suspect:` and why, by signs that need no truth (`docs/stability.md`); None where the scene
+            was read from a file.
         steps: fields from on the way, by how many steps of distillation had been done (`keep_steps`).
     """
 
@@ -193,6 +206,7 @@ class Scene:
     picture: Image.Image | None = None
     mask: Mask | None = None
     status: str = "ok"
+    verdict: str | None = None
     steps: Mapping[int, RefinedField] = field(default_factory=dict)
 
     def render(self, azimuth: float = 0.0, elevation: float | None = None, height: int | None = None) -> Image.Image:

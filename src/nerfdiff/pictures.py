@@ -5,6 +5,7 @@ import logging
 import shutil
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -19,6 +20,7 @@ from nerfdiff.exports.export import FieldExport, check_formats
 from nerfdiff.exports.views import over, render_rgba
 from nerfdiff.fit.saved_field import FIELD, STEPS, save_steps
 from nerfdiff.results.pictures import contact_sheet
+from nerfdiff.stability.judge import OK
 from nerfdiff.utils.config import plain
 from nerfdiff.utils.errors import ConfigError, DataError, UserError
 from nerfdiff.utils.files import write_text
@@ -43,8 +45,11 @@ def pictures(cfg: DictConfig) -> list[Path]:
     check_formats(cfg.format)
     if not cfg.images:
         raise ConfigError(f"name a picture: {' '.join(command_words('picture'))} car.jpg")
-    if cfg.mask is not None and len(cfg.images) > 1:
-        raise ConfigError(f"mask={cfg.mask} is of one picture, and there are {len(cfg.images)}: give one at a time")
+    for key in ("mask", "box"):
+        if cfg[key] is not None and len(cfg.images) > 1:
+            raise ConfigError(
+                f"{key}={cfg[key]} is of one picture, and there are {len(cfg.images)}: give one at a time"
+            )
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
     model = load(cfg.ckpt, cfg.device, cfg.weights)
@@ -88,19 +93,20 @@ def _make(cfg: DictConfig, model: Model, image: Path, folder: Path) -> None:
         shutil.rmtree(folder / STEPS, ignore_errors=True)  # of an earlier scene
         scene.save(folder / FIELD)
         save_steps(folder, scene.saved, scene.steps)
-        write_text(
-            folder / SCENE, json.dumps({"picture": str(image), "identity": identity, "status": scene.status}) + "\n"
-        )
+        facts = {"picture": str(image), "identity": identity, "status": scene.status, "verdict": scene.verdict}
+        write_text(folder / SCENE, json.dumps(facts) + "\n")
     else:
         log.info("%s: the scene is there already, in %s", image, folder / FIELD)
     written = [_views(scene, batch.source[0].cpu(), folder / "views.png")]
-    facts = {"picture": str(image), "status": scene.status, "folder": str(folder)}
+    facts = {"picture": str(image), "status": scene.status, "verdict": scene.verdict, "folder": str(folder)}
     show_picture(cfg, Path(cfg.out), folder.name, facts, written[0])
     export = FieldExport.of(scene.saved, cfg)
     for kind in cfg.format:
         name = {"mp4": "orbit", "gif": "orbit", "html": "viewer"}.get(kind, folder.name)
         written += export.write(folder, name, [kind])
     print(*written, sep="\n")
+    if scene.verdict != OK:
+        print(f"{scene.verdict} (docs/pictures.md#suspect-scenes)")
     more = " ".join([*command_words("export"), f"field={folder / FIELD}", "format=gif,png"])
     print(f"next: look at {written[0]}; for other files: {more}")
 
@@ -116,9 +122,11 @@ def _identity(cfg: DictConfig, model: Model, image: Path, mask: Mask | None) -> 
 
 def _kept(folder: Path, identity: str, model: Model) -> Scene | None:
     """The scene that is there, if it is the one that would be made."""
-    with suppress(OSError, ValueError, UserError):
-        if json.loads((folder / SCENE).read_text())["identity"] == identity:
-            return load_scene(folder / FIELD, str(model.device))
+    with suppress(OSError, ValueError, KeyError, UserError):  # of another version, or damaged
+        facts = json.loads((folder / SCENE).read_text())
+        if facts["identity"] == identity:
+            scene = load_scene(folder / FIELD, str(model.device))
+            return replace(scene, status=facts["status"], verdict=facts["verdict"])
     return None
 
 

@@ -76,6 +76,11 @@ class Upright:
         front = self.around(source, torch.zeros(1).to(self.up), torch.zeros(1).to(self.up)).c2w[0, :3, 2].neg()
         return torch.stack([torch.linalg.cross(self.up, front), self.up, front])
 
+    def elevation(self, cameras: Cameras) -> Float[Tensor, "n"]:
+        """Degrees above the horizon from which cameras [n] look at the point."""
+        arms = cameras.centres - self.point
+        return torch.rad2deg(torch.asin((arms @ self.up / arms.norm(dim=-1)).clamp(-1, 1)))
+
     def around(self, source: Cameras, azimuth: Float[Tensor, "n"], elevation: Float[Tensor, "n"] | None) -> Cameras:
         """Cameras [n] that look at the point from the distance of the camera `source` [1], with its lens.
 

@@ -12,7 +12,7 @@ from nerfdiff.cli import load_config
 from nerfdiff.data.cutout import CutOut, _doubts, write_mask
 from nerfdiff.inputs import ASSETS
 from nerfdiff.utils.errors import ConfigError, DataError
-from photographs import noise, photograph
+from photographs import bricks, noise, photograph
 
 
 @pytest.fixture(autouse=True)
@@ -47,7 +47,27 @@ def test_the_object_of_a_photograph_is_found(tmp_path, size, centre, share, seed
     truth = photograph(*wagon(), tmp_path / "car.jpg", size, centre, share, seed)
     found = cut_out().find(tmp_path / "car.jpg")
     assert found.where.shape == size and iou(found.where, truth) > 0.85
-    assert "without a network" in found.how and found.doubts == ()
+    assert "without a network" in found.how
+    assert [doubt for doubt in found.doubts if "is an edge of colours" not in doubt] == []
+
+
+def test_bricks_are_no_object(tmp_path):
+    truth = photograph(*wagon(), tmp_path / "car.jpg", (300, 400), (0.45, 0.6), 0.7, 0, bricks((300, 400), 0))
+    assert iou(cut_out().find(tmp_path / "car.jpg").where, truth) > 0.75
+
+
+def test_a_box_says_which_object_is_meant(tmp_path):
+    photograph(*wagon(), tmp_path / "a.png", (300, 400), (0.25, 0.55), 0.5, 3)
+    both = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")) / 255
+    truth = photograph(*wagon(), tmp_path / "two.png", (300, 400), (0.75, 0.5), 0.5, 0, both)
+    rows, columns = (np.flatnonzero(truth.any(axis)) for axis in (1, 0))
+    box = [int(edge) for edge in (columns[0] - 6, rows[0] - 6, columns[-1] + 8, rows[-1] + 5)]
+    found = cut_out(box=box).find(tmp_path / "two.png")
+    assert iou(found.where, truth) > 0.8 and found.doubts == ()
+    assert "another part of the picture stands out as well" in cut_out().find(tmp_path / "two.png").doubts
+    for box in ([0, 0, 4, 100], [300, 10, 100, 90], [0, 0, 401, 300]):
+        with pytest.raises(ConfigError, match=r"box=\[.*within the picture's 400x300"):
+            cut_out(box=box).find(tmp_path / "two.png")
 
 
 def test_a_photograph_held_upright_is_cut_out_upright(tmp_path):
@@ -61,7 +81,7 @@ def test_a_photograph_held_upright_is_cut_out_upright(tmp_path):
 def test_a_photograph_of_nothing_is_refused_and_says_what_to_give(tmp_path):
     for name, pixels in (("grey", np.full((60, 80, 3), 0.5)), ("noise", noise((60, 80), 0, 0.0))):
         Image.fromarray((pixels * 255).astype(np.uint8)).save(tmp_path / f"{name}.png")
-    with pytest.raises(DataError, match=r"grey\.png: no object stands out.*Give a mask"):
+    with pytest.raises(DataError, match=r"grey\.png: no object stands out.*give a mask"):
         cut_out().find(tmp_path / "grey.png")
 
 

@@ -18,7 +18,7 @@ from nerfdiff.evaluation.dashboard import Dashboard, accuracy_layout, show_in_da
 from nerfdiff.metrics.predictions import PredictionWriter
 from nerfdiff.results.row import ResultRow
 
-LAYOUT = {"Accuracy": {"PSNR": ["accuracy/psnr"]}, "Distillation": {"agreement": ["distill/agreement"]}}
+LAYOUT = {"Accuracy": {"PSNR": ["accuracy/1_psnr"]}, "Distillation": {"agreement": ["distill/agreement"]}}
 
 
 def config(home: Path):
@@ -83,7 +83,7 @@ def test_a_row_becomes_a_run_with_its_settings_numbers_text_and_pictures(tmp_pat
         dashboard.write(config(tmp_path), row(tmp_path), sheet)
     events = read(tmp_path / "tensorboard" / "ngd seed=0 budget.steps=16")
     found = {tag: values for tag, values in scalars(events).items() if not tag.startswith(("distill/", "scenes/"))}
-    assert found == {"accuracy/psnr": [22.0], "cost/scene_s": [3.5], "counts/denoiser_calls": [50.0]}
+    assert found == {"accuracy/1_psnr": [22.0], "cost/scene_s": [3.5], "counts/denoiser_calls": [50.0]}
     start = metadata.parse_session_start_info_plugin_data(
         events.PluginTagToContent(metadata.PLUGIN_NAME)[metadata.SESSION_START_INFO_TAG]
     )
@@ -93,7 +93,7 @@ def test_a_row_becomes_a_run_with_its_settings_numbers_text_and_pictures(tmp_pat
     (image,) = events.Images("accuracy/pictures")
     assert (image.width, image.height) == (7, 5)
     assert "python src/distill.py strategy=ngd" in text(events, "about")
-    assert "| accuracy/psnr | 22 |" in text(events, "about")
+    assert "| accuracy/1_psnr | 22 |" in text(events, "about")
     assert "seed: 0" in text(events, "config") and "not: shown" not in text(events, "config")
 
 
@@ -141,8 +141,8 @@ def test_runs_are_called_by_what_tells_them_apart_and_keep_to_themselves(tmp_pat
     for _ in range(2):
         dashboard.write(config(tmp_path), other, None)
     (second,) = (path.parent for path in tmp_path.rglob("events.*") if path.parent.name not in runs)
-    assert second.name.startswith("ngd budget.steps=16 ") and scalars(read(second))["accuracy/psnr"] == [5.0]
-    assert scalars(read(second.parent / "ngd budget.steps=16"))["accuracy/psnr"] == [22.0]
+    assert second.name.startswith("ngd budget.steps=16 ") and scalars(read(second))["accuracy/1_psnr"] == [5.0]
+    assert scalars(read(second.parent / "ngd budget.steps=16"))["accuracy/1_psnr"] == [22.0]
 
 
 def test_a_picture_has_an_entry(tmp_path):
@@ -176,7 +176,7 @@ def test_the_configured_layout_names_tags_that_are_written(command, tmp_path):
         written |= set(EventAccumulator(str(path.parent)).Reload().Tags()["scalars"])
     layout = accuracy_layout() | dict(cfg.dashboard.layout)
     shown = {tag for charts in layout.values() for tags in charts.values() for tag in tags}
-    assert shown - written == {"accuracy/ssim", "scenes/lpips"}  # which were not measured here
+    assert shown - written == {"accuracy/2_ssim", "scenes/lpips"}  # which were not measured here
 
 
 def test_no_dashboard_and_one_that_cannot_be_written_cost_no_run(tmp_path, caplog):
@@ -205,10 +205,10 @@ def test_tensorboard_itself_compares_the_runs(tmp_path):
 
     layout = ask("plugin/custom_scalars/layout")
     charts = {c["title"]: c["multiline"]["tag"] for category in layout["category"] for c in category["chart"]}
-    assert charts == {"PSNR": ["accuracy/psnr"], "agreement": ["distill/agreement"]}  # each once for all runs
+    assert charts == {"PSNR": ["accuracy/1_psnr"], "agreement": ["distill/agreement"]}  # each once for all runs
     experiment = ask("plugin/hparams/experiment", {"experimentName": ""})
     assert {info["name"] for info in experiment["hparamInfos"]} >= {"strategy", "K", "budget.steps", "budget.rays"}
-    metrics = ["accuracy/psnr", "cost/scene_s", "counts/denoiser_calls"]
+    metrics = ["accuracy/1_psnr", "cost/scene_s", "counts/denoiser_calls"]
     assert sorted(info["name"]["tag"] for info in experiment["metricInfos"])[:3] == metrics
     wanted = {"allowedStatuses": ["STATUS_SUCCESS"], "startIndex": 0, "sliceSize": 10}
     columns = [{"metric": {"tag": tag}} for tag in metrics]
@@ -216,5 +216,5 @@ def test_tensorboard_itself_compares_the_runs(tmp_path):
     found = []
     for group in groups:
         values = {value["name"]["tag"]: value["value"] for value in group["metricValues"]}
-        found.append((group["hparams"].get("budget.rays"), values["accuracy/psnr"], values["cost/scene_s"]))
+        found.append((group["hparams"].get("budget.rays"), values["accuracy/1_psnr"], values["cost/scene_s"]))
     assert sorted(found, key=str) == [(64, 23.0, 3.5), (None, 22.0, 3.5)]

@@ -50,7 +50,7 @@ def test_an_evaluation_leaves_rows_scores_and_pictures(data, run, tmp_path, stra
     runs = {path.parent.relative_to(tmp_path / "tensorboard").as_posix() for path in tmp_path.rglob("events.*")}
     assert runs == {name, "copy_input", "mean_image"}
     events = EventAccumulator(str(tmp_path / "tensorboard" / name)).Reload()
-    assert events.Scalars("accuracy/psnr")[0].value == pytest.approx(rows[0].psnr)
+    assert events.Scalars("accuracy/1_psnr")[0].value == pytest.approx(rows[0].psnr)
     assert events.Images("accuracy/pictures") and len(events.Scalars("scenes/psnr")) == 2
     assert len({row.run_id for row in rows}) == 3
 

@@ -202,10 +202,17 @@ class Picture:
             rows, columns = where.shape
             tall = max(rows, columns / aspect)
             return (rows - tall) / 2, (columns - tall * aspect) / 2, tall, tall * aspect
-        top, bottom, left, right = _box(where)
-        tall = max(bottom - top, (right - left) / aspect) / self.object_share
-        x, y = self.object_centre
-        return (top + bottom) / 2 - y * tall, (left + right) / 2 - x * tall * aspect, tall, tall * aspect
+        return window_around(where, aspect, self.object_share, self.object_centre)
+
+
+def window_around(
+    where: Bool[np.ndarray, "rows columns"], aspect: float, share: float, centre: Sequence[float]
+) -> tuple[float, float, float, float]:
+    """(top, left, height, width) of a window that an object fills to a share, around a point; see `Picture`."""
+    top, bottom, left, right = _box(where)
+    tall = max(bottom - top, (right - left) / aspect) / share
+    x, y = centre
+    return (top + bottom) / 2 - y * tall, (left + right) / 2 - x * tall * aspect, tall, tall * aspect
 
 
 def _border(shape: tuple[int, int]) -> Bool[np.ndarray, "height width"]:

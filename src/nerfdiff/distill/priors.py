@@ -143,6 +143,10 @@ class Sphere:
     def __post_init__(self):
         if self.views < 1:
             raise ConfigError(f"prior.views={self.views} must be at least 1 (budget.views)")
+        if isinstance(self.source_elevation, str):
+            raise ConfigError(
+                f"prior.source_elevation={self.source_elevation}: expected degrees; auto is for pictures alone"
+            )
         (low, high), (start, end) = self.elevation, self.azimuth
         if not -90 < low <= high < 90 or not start < end <= start + 360 or not -90 < self.source_elevation < 90:
             raise ConfigError(

@@ -136,7 +136,11 @@ def accuracy_layout() -> Layout:
 
 
 def _tag(metric: Metric) -> str:
-    return f"{'details' if metric.detail else 'accuracy'}/{metric.name}"
+    """Return a metric's tag, numbered so that PSNR comes first where TensorBoard sorts."""
+    if metric.detail:
+        return f"details/{metric.name}"
+    shown = [name for name, other in METRICS.items() if not other.detail]
+    return f"accuracy/{shown.index(metric.name) + 1}_{metric.name}"
 
 
 def show_in_dashboard(cfg: DictConfig, rows: Sequence[ResultRow], sheet: Path | None = None) -> None:

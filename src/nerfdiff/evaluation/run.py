@@ -23,7 +23,8 @@ from nerfdiff.distill.strategy import Strategy
 from nerfdiff.exported_model import LoadedModel
 from nerfdiff.model import NerfDiff
 from nerfdiff.results.environment import hardware
-from nerfdiff.stability.familiar import Familiar
+from nerfdiff.stability.elevation import framed
+from nerfdiff.stability.familiar import Familiar, features
 from nerfdiff.stability.judge import Judge
 from nerfdiff.stability.mend import mend_of
 from nerfdiff.stress.stress import Stress, row_fields, stress_of
@@ -250,8 +251,9 @@ def picture_run(cfg: DictConfig, device: torch.device) -> EvaluationRun:
         raise ConfigError(f"shard={cfg.shard} is of a dataset's scenes, and image={cfg.image} is one picture")
     if (stress := stress_of(cfg)) is not None and stress.input_view is not None:
         raise ConfigError(f"stress={stress.axis} chooses another input view, and a picture has none")
-    cfg = framed_as_trained(cfg, loaded)
-    scene = picture_scene(cfg, size)
+    framed = framed_as_trained(cfg, loaded)
+    scene = picture_scene(framed, loaded, size)
+    cfg.picture, cfg.picture_views = framed.picture, framed.picture_views  # what was estimated, for the strategy
     facts = {
         "split_sha256": sha256_values(list(scene.scene_ids)),
         "files_sha256": [sha256_file(file) for file in (cfg.image, cfg.picture.mask) if file],
@@ -268,6 +270,7 @@ def framed_as_trained(cfg: DictConfig, loaded: LoadedModel) -> DictConfig:
 
     What the model does not say, `cfg.framing` does, and a log line names it.
     """
+    cfg = copy.deepcopy(cfg)
     asked = [key for key, value in cfg.picture.items() if value == AUTO]
     if not asked:
         return cfg
@@ -281,14 +284,18 @@ def framed_as_trained(cfg: DictConfig, loaded: LoadedModel) -> DictConfig:
             loaded.path,
             ", picture.".join(asked),
         )
-    cfg = copy.deepcopy(cfg)
     for key in asked:
         cfg.picture[key] = known[key]
     return cfg
 
 
-def picture_scene(cfg: DictConfig, size: Sequence[int], where: np.ndarray | None = None) -> ViewBatch:
+def picture_scene(
+    cfg: DictConfig, loaded: LoadedModel, size: Sequence[int], where: np.ndarray | None = None
+) -> ViewBatch:
     """The scene of the picture `cfg.image`, whose targets are the cameras of `cfg.picture_views`, not yet known.
+
+    An elevation of `auto` is estimated by the model, or taken to be `cfg.usual_elevation` where it cannot; `cfg` then
+    has the number, and a log line says so.
 
     Args:
         size: (height, width) of the model's images.
@@ -298,10 +305,42 @@ def picture_scene(cfg: DictConfig, size: Sequence[int], where: np.ndarray | None
         UserError: bad picture or config.
     """
     scene = instantiate(cfg.picture).load(cfg.image, tuple(size), where)
+    if cfg.picture_views.get("source_elevation") == AUTO:
+        cfg.picture_views.source_elevation = _elevation(cfg, loaded, scene)
     cameras = instantiate(cfg.picture_views)(scene)
     blank = scene.source_pixels[:, None].expand(-1, cameras.shape[1], -1, -1, -1)
     names = tuple(f"{view:03d}" for view in range(cameras.shape[1]))
     return replace(scene, target_cameras=cameras, target_pixels=blank, target_views=(names,))
+
+
+def _elevation(cfg: DictConfig, loaded: LoadedModel, scene: ViewBatch) -> float:
+    """Estimate the degrees from which a picture looks down at its object."""
+    key = "elevation" if "elevation" in cfg else "picture_views.source_elevation"
+    familiar = Familiar.beside(loaded.path)
+    fit = None if familiar is None else familiar.elevation
+    if fit is None or not fit.useful or familiar.framing() is None:
+        log.warning(
+            "%s cannot estimate elevations (docs/stability.md: part=familiar): %s is taken to look down from %g "
+            "degrees at its object; say %s=… if that is wrong",
+            loaded.path,
+            cfg.image,
+            cfg.usual_elevation,
+            key,
+        )
+        return float(cfg.usual_elevation)
+    with torch.no_grad():
+        own = next(loaded.model.parameters()).device
+        shown = framed(scene, familiar.framing()).to(own)
+        found = round(float(fit(features(loaded.model.encode(shown)))[0]), 1)
+    log.info(
+        "%s is estimated to look down from %g degrees at its object (of training images 9 of 10 are missed by at most "
+        "%.0f); say %s=… if that is wrong",
+        cfg.image,
+        found,
+        fit.most,
+        key,
+    )
+    return found
 
 
 def _run(

@@ -2,7 +2,6 @@
 
 import base64
 import json
-import math
 from html import escape
 from pathlib import Path
 from string import Template
@@ -71,7 +70,7 @@ def write_viewer(path: Path, saved: SavedField, stands: Upright, title: str, cel
         "up": stands.up.tolist(),
         "front": stands.axes(source)[2].tolist(),
         "distance": float(arm.norm()),
-        "elevation": math.degrees(math.asin(float((arm @ stands.up) / arm.norm()))),
+        "elevation": float(stands.elevation(source)[0]),
         "samples": samples,
     }
     page = Template(PAGE.read_text(encoding="utf-8").replace("${", "$${"))  # JavaScript's own

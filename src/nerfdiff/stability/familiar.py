@@ -16,6 +16,7 @@ from torch import Tensor
 
 from nerfdiff.data.batch import ViewBatch
 from nerfdiff.field.encoder import Encoding
+from nerfdiff.stability.elevation import Elevation
 from nerfdiff.stability.facts import FACTS, OF_PICTURE, excess, facts, of_picture, usual_range
 from nerfdiff.stress.photo import Picture
 from nerfdiff.utils.errors import DataError
@@ -45,6 +46,7 @@ class Familiar:
         rest: root mean square of what the axes leave, over dimensions and images.
         usual: distance that 99 % of images held out from the axes do not exceed.
         ranges: lower end, median and upper end of the training inputs' facts; None in files from before there were any.
+        elevation: estimates a framed picture's from its features; None where it is not known, or was not then.
     """
 
     mean: Float[Tensor, "dim"]
@@ -53,6 +55,7 @@ class Familiar:
     rest: float
     usual: float
     ranges: Float[Tensor, "facts 3"] | None = None
+    elevation: Elevation | None = None
 
     @staticmethod
     def of(found: Float[Tensor, "images dim"], kept: int, known: Float[Tensor, "images facts"]) -> "Familiar":
@@ -128,9 +131,13 @@ class Familiar:
         tensors = {"mean": self.mean, "axes": self.axes.half(), "spread": self.spread}
         if self.ranges is not None:
             tensors["ranges"] = self.ranges.contiguous()
-        about = {"rest": self.rest, "usual": self.usual}
+        about = {"familiar": json.dumps({"rest": self.rest, "usual": self.usual}), "facts": json.dumps(list(FACTS))}
+        if self.elevation is not None:
+            numbers = dict(vars(self.elevation))
+            tensors["elevation"] = numbers.pop("weights")
+            about["elevation"] = json.dumps(numbers)
         with atomic(path) as temporary:
-            save_file(tensors, temporary, {"familiar": json.dumps(about), "facts": json.dumps(list(FACTS))})
+            save_file(tensors, temporary, about)
 
     @staticmethod
     def beside(weights: Path) -> "Familiar | None":
@@ -157,7 +164,9 @@ class Familiar:
                     log.warning("%s: has no ranges of this version's facts; make it again (docs/stability.md)", path)
                 ranges = file.get_tensor("ranges") if names == list(FACTS) else None
                 parts = (file.get_tensor(name).float() for name in ("mean", "axes", "spread"))
-                return Familiar(*parts, **numbers, ranges=ranges)
+                about = file.metadata().get("elevation")
+                elevation = about and Elevation(file.get_tensor("elevation"), **json.loads(about))
+                return Familiar(*parts, **numbers, ranges=ranges, elevation=elevation)
         except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
             raise DataError(
                 f"{path}: cannot be read ({error}); delete it, or make it again (docs/stability.md)"

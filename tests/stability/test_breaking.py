@@ -262,13 +262,13 @@ def test_runs_of_training_are_a_table_with_those_that_did_not_end():
         return ResultRow(run_id="r", time=TIME, stress=stress, severity=severity, **more)
 
     rows = [
-        row(psnr=20.1, held_out_loss=0.01, loss_spikes=0, nonfinite_grad_steps=0, grad_norm_p99=1.5),
-        row(psnr=19.9, held_out_loss=0.02, loss_spikes=0, nonfinite_grad_steps=0, grad_norm_p99=1.5),
-        row("train_lr", 30.0, psnr=15.0, loss_spikes=4, nonfinite_grad_steps=2, grad_norm_p99=9.0),
-        row("train_lr", 10.0, psnr=12.0, loss_spikes=1, verdict="suspect: held-out renderings have 12.0 dB"),
+        row(seed=1, psnr=20.1, held_out_loss=0.01, loss_spikes=0, nonfinite_grad_steps=0, grad_norm_p99=1.5),
+        row(seed=2, psnr=19.9, held_out_loss=0.02, loss_spikes=0, nonfinite_grad_steps=0, grad_norm_p99=1.5),
+        row("train_lr", 30.0, seed=1, psnr=15.0, loss_spikes=4, nonfinite_grad_steps=2, grad_norm_p99=9.0),
+        row("train_lr", 10.0, seed=2, psnr=12.0, loss_spikes=1, verdict="suspect: held-out renderings have 12.0 dB"),
         row("train_lr", 30.0, status="diverged", error="gradients", loss_spikes=6, nonfinite_grad_steps=20),
     ]
     text = training_markdown(rows, stress_files())
     assert "| none | – | 20.00 ± 0.14 | +0.00 | 0.0150 ± 0.0071 | 0.00 | 0.00 | 1.50 | – | 0 of 2 | 2 of 2 |" in text
-    assert "| learning rate | ×30 | 15.00 | -5.00 | – | 5.00 | 11.00 | 9.00 | 1 of 2 | 0 of 2 | 1 of 2 |" in text
-    assert "| learning rate | ×10 | 12.00 | -8.00 | – | 1.00 | – | – | 0 of 1 | 1 of 1 | 1 of 1 |" in text
+    assert "| learning rate | ×30 | 15.00 | -5.10 | – | 5.00 | 11.00 | 9.00 | 1 of 2 | 0 of 2 | 1 of 2 |" in text
+    assert "| learning rate | ×10 | 12.00 | -7.90 | – | 1.00 | – | – | 0 of 1 | 1 of 1 | 1 of 1 |" in text

@@ -121,14 +121,14 @@ def training_markdown(rows: Sequence[ResultRow], axes: Mapping[str, DictConfig])
     for row in rows:
         groups.setdefault((row.stress or "none", row.severity), []).append(row)
     table = [
-        ["stress", "severity", "held-out PSNR, dB", "against clean", "CDM's held-out loss", "spikes"]
+        ["stress", "severity", "held-out PSNR, dB", "against clean of the same seeds", "CDM's held-out loss", "spikes"]
         + ["steps without a gradient", "99 % of gradient norms", "recovered", "suspect", "runs that ended"]
     ]
-    clean = _mean([row.psnr for row in groups.get(("none", None), ())])
+    clean = {row.seed: row.psnr for row in groups.get(("none", None), ()) if row.psnr is not None}
     for (axis, severity), own in sorted(
         groups.items(), key=lambda item: (item[0][0] != "none", item[0][0], item[0][1] or 0)
     ):
-        psnr = _mean([row.psnr for row in own])
+        gained = _mean([row.psnr - clean[row.seed] for row in own if row.psnr is not None and row.seed in clean])
         upset = [row for row in own if row.loss_spikes or row.nonfinite_grad_steps]
         recovered = (
             f"{sum(row.status == 'ok' and (row.verdict or OK) == OK for row in upset)} of {len(upset)}"
@@ -141,7 +141,7 @@ def training_markdown(rows: Sequence[ResultRow], axes: Mapping[str, DictConfig])
                 stress.name if stress is not None else axis,
                 severity_text(stress, severity) if stress is not None else "–",
                 _with_spread([row.psnr for row in own]),
-                "–" if psnr is None or clean is None else f"{psnr - clean:+.2f}",
+                "–" if gained is None else f"{gained:+.2f}",
                 _with_spread([row.held_out_loss for row in own], 4),
                 *(number_text(_mean([getattr(row, key) for row in own])) for key in COUNTS),
                 recovered,

@@ -10,7 +10,8 @@
 # $PACKS/cars.zip (default: .gpu; made by benchmarks/pack_scenes.py). TINY=1: sizes of seconds, to try it on a CPU.
 set -u
 cd "$(dirname "$0")/.."
-part=${1:?usage: benchmarks/gpu.sh 1|2 [seconds]} end=$((SECONDS + ${2:-420}))
+case ${1:-} in 1 | 2) ;; *) echo "usage: benchmarks/gpu.sh 1|2 [seconds]" >&2; exit 2 ;; esac
+part=$1 end=$((SECONDS + ${2:-420}))
 export OUT=${OUT:-$PWD/benchmarks/results/gpu} PACKS=${PACKS:-.gpu} PYTHONUNBUFFERED=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-4}
 work=$(mktemp -d) python=${PYTHON:-python3} tiny=${TINY:-}
 mkdir -p "$OUT" "$work/site" "$work/results"

@@ -87,6 +87,7 @@ def test_known_rows_give_the_known_heat_map(page):
 def test_silent_failures_are_the_headline(page):
     """ngd at ×0.7 and both at `front`, two scenes each, with status and verdict ok; at ×2 the judge tells."""
     assert page.inner_text("#silent").startswith("Silent failures: 6 of 10 broken scenes")
+    assert "6 by rule (b), 0 by rule (c) alone" in page.inner_text("#silent")
     assert page.get_attribute("#silent", "class") == "bad"
     assert "● 2 silent" in cell(page, "focal", "ngd").inner_text()
 

@@ -1,16 +1,26 @@
 """Stresses through the commands: rows, verdicts, controls of the metrics, training."""
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
+from omegaconf import OmegaConf
+from PIL import Image
 
 from nerfdiff.cli import load_config
 from nerfdiff.evaluation.calibrate import calibrate
 from nerfdiff.evaluation.controls import controls_markdown
 from nerfdiff.evaluation.distill import distill
 from nerfdiff.evaluation.evaluate import evaluate
+from nerfdiff.results.frame import Run
 from nerfdiff.results.row import read_rows
+from nerfdiff.stability.breaking import Failure
 from nerfdiff.stability.familiar import Familiar
+from nerfdiff.stability.silent import Silent
+from nerfdiff.stress.axes import stress_files
+from nerfdiff.sweeps.silent_sheet import silent_sheet
+from nerfdiff.training.rows import verdict
 from nerfdiff.utils.errors import ConfigError
 from training_fixtures import evaluation_overrides, run_training
 
@@ -39,6 +49,24 @@ def test_rows_have_axis_and_severity_and_no_severity_is_no_stress_to_the_bit(dat
     assert rgb(tmp_path / "plain") == rgb(tmp_path / "neutral") != rgb(tmp_path / "focal")
     (row,) = read_rows(tmp_path / "focal" / "results.jsonl")
     assert (row.stress, row.severity, row.status) == ("focal", 1.2, "ok")
+
+
+def test_a_silent_failure_is_shown_with_its_input_the_truth_and_the_view(data, run, tmp_path):
+    cfg = config(
+        data, run, tmp_path / "job", "strategy=none", "stress=brightness", f"results={tmp_path / 'rows.jsonl'}"
+    )
+    row = distill(cfg)
+    (tmp_path / "job" / ".hydra").mkdir()
+    OmegaConf.save(cfg, tmp_path / "job" / ".hydra" / "config.yaml")
+    failure = Failure(0, "scene0", "b", 4.0, None, None, False)
+    silent = Silent(stress_files()["brightness"], 0.2, "none", failure, Run(row, tmp_path))
+    sheet = np.asarray(Image.open(silent_sheet(tmp_path / "silent.png", [silent]))).astype(int)
+    # under a line of words, four times as large: 20 x 28 pixels
+    given, truth, view = (sheet[-8 - 80 : -8, 112 * n : 112 * (n + 1)] for n in range(3))
+    views = [np.asarray(Image.open(path)) for path in (tmp_path / "job").glob("*/predictions/none/scene0/rgb/*.png")]
+    assert given.mean() > truth.mean() and any(np.array_equal(view[::4, ::4], each) for each in views)
+    assert not any(np.array_equal(truth[::4, ::4], each) for each in views)
+    assert silent_sheet(tmp_path / "none.png", [replace(silent, run=None)]) is None
 
 
 @pytest.mark.parametrize("axis", ["alien_views", "elevation"])
@@ -102,7 +130,20 @@ def test_a_training_run_leaves_a_row_of_how_it_went(data, tmp_path):
     run_training(data, tmp_path / "run", "trainer.max_steps=3", "validation_every=3", *words)
     (row,) = read_rows(tmp_path / "results.jsonl")
     assert (row.stress, row.severity, row.status, row.strategy) == (stress, severity, "ok", "training")
-    assert row.psnr > 0 and row.nonfinite_grad_steps == 0 and row.grad_norm_p99 > 0 and row.dataset.endswith("/val")
+    assert (
+        row.psnr > 0
+        and row.held_out_loss > 0
+        and row.nonfinite_grad_steps == 0
+        and row.grad_norm_p99 > 0
+        and row.dataset.endswith("/val")
+    )
+
+
+@pytest.mark.parametrize(
+    ("psnr", "said"), [(12.6, "suspect: held-out renderings have 12.6 dB, pictures of one even"), (13.5, "ok")]
+)
+def test_a_training_that_collapsed_is_suspect(psnr, said):
+    assert verdict({"val/psnr": psnr, "val/psnr_even": 13.1}).startswith(said) and verdict({}) is None
 
 
 def test_a_training_run_that_fails_is_a_row(data, tmp_path):

@@ -1,6 +1,7 @@
 """Breaking points of curves whose answer is known."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -19,6 +20,7 @@ from nerfdiff.stability.breaking import (
     point_of,
     sides_of,
 )
+from nerfdiff.stability.silent import COLUMNS, Silent, silent_failures, silent_markdown, worst_of_each
 from nerfdiff.stability.study import studies
 from nerfdiff.stability.text import severity_text, to_markdown, training_markdown
 from nerfdiff.stress.axes import stress_files
@@ -101,7 +103,8 @@ def test_the_mean_is_with_and_without_scenes_that_fell_back_and_lost_ones_are_co
 )
 def test_a_broken_scene_is_silent_if_neither_status_nor_judge_tells(verdict, failed, silent):
     point = point_of(judged(own=outcomes(20.0, failed, verdict, a=16.0)), RULES, BOOTSTRAP)
-    assert point.broken_scenes == ((0, "a"), (1, "a"), (2, "a"))
+    assert [(each.seed, each.scene) for each in point.failures] == [(0, "a"), (1, "a"), (2, "a")]
+    assert {(each.rules, each.loss, each.harm) for each in point.failures} == {("b", 4.0, None)}
     assert len(point.silent) == silent and point.suspect == (30 if verdict and verdict != "ok" else 0)
 
 
@@ -181,6 +184,59 @@ def test_rows_of_a_sweep_give_the_verdicts_that_they_are_made_for(sweep):
     assert by["none"].area == 1.0 and by["ngd"].area > 1.2
 
 
+def test_seeds_in_folders_of_their_own_are_one_study(tmp_path):
+    runs = []
+    for seed in (0, 1):
+        home = tmp_path / str(seed)
+        for severity in (None, 1.5):
+            own = {"stress": "focal", "severity": severity, "neutral": 1.0} if severity else {}
+            write_run(home, "none", 20.0 - seed if severity is None else 15.0, seed=seed, **own)
+        rows = read_runs(home / "results.jsonl")
+        runs += [replace(r, row=replace(r.row, overrides=[*r.row.overrides, f"paths.runs_dir={home}"])) for r in rows]
+    (study,) = studies(runs, stress_files(), RULES, BOOTSTRAP)
+    (point,) = study.verdicts[0].points
+    assert (study.settings, point.total, point.loss.mean) == (("ckpt=demo",), 4, pytest.approx(4.5))
+
+
+def test_another_seed_as_a_stress_is_compared_with_the_seed_that_was_asked_for(tmp_path):
+    """The run with seed 0 and stress=seed has a row of seed 1: it is not the clean run of seed 1."""
+    for seed, psnr in ((0, 20.0), (1, 18.0)):
+        write_run(tmp_path, "ngd", psnr, seed=seed)
+    write_run(tmp_path, "ngd", 18.0, "seed", 1.0, seed=0)
+    runs = read_runs(tmp_path / "results.jsonl")
+    runs[-1] = replace(runs[-1], row=replace(runs[-1].row, seed=1))
+    (study,) = studies(runs, stress_files(), RULES, BOOTSTRAP)
+    assert study.verdicts[0].points[0].loss.mean == pytest.approx(2.0)
+
+
+def test_silent_failures_are_listed_with_their_rules_and_what_the_stress_adds(sweep):
+    (study,) = studies(sweep, stress_files(), RULES, BOOTSTRAP)
+    found = silent_failures(study)
+    assert [(each.words, each.strategy, each.failure.scene) for each in found] == [
+        ("focal length ×1.5 true", "ngd", scene) for scene in "ab"
+    ]
+    assert {key: found[0].line()[key] for key in COLUMNS[:6]} == {
+        "axis": "focal", "severity": 1.5, "strategy": "ngd", "seed": 0, "scene": "a", "rules": "bc",
+    }  # fmt: skip
+    # ngd is 1 dB better than none without stress, 1 dB worse with it
+    failure = found[0].failure
+    assert (failure.loss, failure.harm, failure.clean_harm) == pytest.approx((4.0, 1.0, -1.0))
+    assert found[0].harmed_by_stress(RULES) and [each.failure.scene for each in worst_of_each(found)] == ["a"]
+    text = silent_markdown(found, RULES)
+    assert text.startswith("2 scenes by rule (b), 0 by rule (c) alone.")
+    assert "| focal length ×1.5 true | 2 | 2 | ngd | ngd, a, seed 0 (bc) | 4.00 | 1.00 |" in text
+
+
+@pytest.mark.parametrize(("clean", "by_stress"), [(20.0, True), (19.2, False), (19.0, False), (21.0, True)])
+def test_a_strategy_that_is_worse_than_none_without_stress_too_is_told_apart(clean, by_stress):
+    own = {(0, "a"): Outcome(18.4)}
+    none, before = {(0, "a"): Outcome(19.0)}, {(0, "a"): Outcome(20.0)}
+    case = Judged(1.0, own, {(0, "a"): Outcome(clean)}, none, {}, clean_none=before)
+    (failure,) = point_of(case, RULES, BOOTSTRAP).failures
+    each = Silent(stress_files()["focal"], 1.0, "ngd", failure, None)
+    assert failure.rules == "c" and each.harmed_by_stress(RULES) == by_stress
+
+
 def test_verdicts_are_written_as_tables_in_the_axis_own_units(sweep):
     text = to_markdown(
         studies(sweep, stress_files(), RULES, BOOTSTRAP), ["stress=halo stress.severity=4"], ["elevation: -10°"]
@@ -206,10 +262,13 @@ def test_runs_of_training_are_a_table_with_those_that_did_not_end():
         return ResultRow(run_id="r", time=TIME, stress=stress, severity=severity, **more)
 
     rows = [
-        row(psnr=20.0, loss_spikes=0, nonfinite_grad_steps=0, grad_norm_p99=1.5),
+        row(psnr=20.1, held_out_loss=0.01, loss_spikes=0, nonfinite_grad_steps=0, grad_norm_p99=1.5),
+        row(psnr=19.9, held_out_loss=0.02, loss_spikes=0, nonfinite_grad_steps=0, grad_norm_p99=1.5),
         row("train_lr", 30.0, psnr=15.0, loss_spikes=4, nonfinite_grad_steps=2, grad_norm_p99=9.0),
+        row("train_lr", 10.0, psnr=12.0, loss_spikes=1, verdict="suspect: held-out renderings have 12.0 dB"),
         row("train_lr", 30.0, status="diverged", error="gradients", loss_spikes=6, nonfinite_grad_steps=20),
     ]
     text = training_markdown(rows, stress_files())
-    assert "| none | – | 20.00 | +0.00 | 0.00 | 0.00 | 1.50 | – | 1 of 1 |" in text
-    assert "| learning rate | ×30 | 15.00 | -5.00 | 5.00 | 11.00 | 9.00 | 1 of 2 | 1 of 2 |" in text
+    assert "| none | – | 20.00 ± 0.14 | +0.00 | 0.0150 ± 0.0071 | 0.00 | 0.00 | 1.50 | – | 0 of 2 | 2 of 2 |" in text
+    assert "| learning rate | ×30 | 15.00 | -5.00 | – | 5.00 | 11.00 | 9.00 | 1 of 2 | 0 of 2 | 1 of 2 |" in text
+    assert "| learning rate | ×10 | 12.00 | -8.00 | – | 1.00 | – | – | 0 of 1 | 1 of 1 | 1 of 1 |" in text

@@ -129,6 +129,10 @@ def test_an_image_unlike_the_training_images_is_far_from_them(net, scene, tmp_pa
         assert float(known.distance(features(net.encode(scene)))[0]) < 1.3
         found = signs(net, black, PredictedViews(black.source.expand(3, -1, -1, -1)), known)
         assert found["unlike"] > 2 and found["size"] > 0.2 and found["near"] == 0
+    # of an input that was sharpened, the facts are those of before
+    before = replace(scene, soft_pixels=black.source_pixels)
+    sizes = [signs(net, each, PredictedViews(scene.targets[0]), familiar)["size"] for each in (scene, before)]
+    assert sizes == [0, found["size"]]
     save_file({name: part for name, part in load_file(path).items() if name != "ranges"}, path, OLD)
     assert Familiar.load(path).ranges is None and "make it again" in caplog.text
     path.write_bytes(b"no")

@@ -11,7 +11,7 @@ from nerfdiff.cli import load_config
 from nerfdiff.inputs import ASSETS
 from nerfdiff.stability.facts import facts, of_picture
 from nerfdiff.stability.familiar import Familiar
-from nerfdiff.stability.mend import Mend, mend_of
+from nerfdiff.stability.mend import Mend, mend_of, sharpened
 from nerfdiff.stress import cutout, framing, photo
 from nerfdiff.stress.photo import object_mask
 
@@ -60,11 +60,22 @@ def test_a_soft_picture_is_sharpened_towards_the_true_one(mend):
     for number in range(1000, 1010):
         true = picture(number)
         soft, inside = photo.low_resolution(true, 0.6, DRAWS), object_mask(true)
-        after, done = mend.picture(soft)
-        assert any("sharpened" in words for words in done), done
+        before, strength, done = mend.picture(soft)
+        assert strength > 0 and any("sharpened" in words for words in done), done
+        after = sharpened(before, strength)
         assert abs(of_picture(after)["sharpness"] - usual) < abs(of_picture(soft)["sharpness"] - usual)
         better += error(after[:, inside], true[:, inside]) < error(soft[:, inside], true[:, inside])
     assert better >= 8
+
+
+def test_the_judge_sees_a_soft_picture_as_it_was_and_a_peeled_one_as_it_is(mend):
+    """What was sharpened is suspect all the same; what was cut out too large is as good as new."""
+    for number in range(1000, 1010):
+        soft = mend(scene(photo.low_resolution(picture(number), 0.6, DRAWS)))
+        peeled = mend(scene(cutout.mask_size(picture(number), 1, DRAWS, 0.4)))
+        assert peeled.soft_pixels is None and not torch.equal(soft.soft_pixels, soft.source_pixels)
+        found = mend.familiar.picture_beyond(soft.soft_pixels[0].float() / 255)["sharpness"]
+        assert found > 0.2 > mend.familiar.picture_beyond(peeled.source[0])["sharpness"]
 
 
 @pytest.mark.parametrize(
@@ -83,7 +94,7 @@ def test_levels_place_and_noise_stay_as_they_are_given(mend, change):
 
 
 def test_a_picture_of_nothing_stays(mend):
-    assert mend.picture(torch.ones(3, 32, 32))[1] == []
+    assert mend.picture(torch.ones(3, 32, 32))[1:] == (0.0, [])
 
 
 def test_without_ranges_or_wish_there_is_none(mend):

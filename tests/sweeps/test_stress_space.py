@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 from omegaconf import OmegaConf
 
-from nerfdiff.cli import load_config
+from nerfdiff.cli import CONF, load_config
 from nerfdiff.stress.axes import stress_files
 from nerfdiff.sweeps.stress_space import StressSpace, acts, severities_of
 from nerfdiff.utils.errors import ConfigError
@@ -130,3 +130,11 @@ def train_config():
 def test_a_stress_acts_where_one_of_its_keys_is():
     seed = stress_files()["seed"]
     assert not acts(seed, compose(["strategy=none"])) and acts(seed, compose(["strategy=ngd_current"]))
+
+
+def test_the_full_sweep_has_every_strategy_that_makes_a_field():
+    """Of variants of one strategy the best alone."""
+    no_field, variants = {"cdm", "copy_input", "mean_image"}, {"ngd_equation", "ngd_first", "sds_fresh"}
+    known = {path.stem for path in (CONF / "strategy").glob("*.yaml")} - no_field - variants
+    asked = OmegaConf.load(CONF / "stability" / "full.yaml").hydra.sweeper.params.strategy
+    assert set(asked.split(",")) == known

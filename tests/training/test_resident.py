@@ -199,8 +199,7 @@ def test_what_cannot_be_trained(begun, tmp_path, monkeypatch):
         ResidentScenes.read(reader, None, torch.device("cpu"))
 
 
-@pytest.mark.parametrize("frozen", [True, False])
-@pytest.mark.parametrize("backend", ["torch", "triton"])
+@pytest.mark.parametrize(("frozen", "backend"), [(True, "torch"), (False, "torch"), (False, "triton")])
 def test_a_step_leaves_nothing_that_only_the_garbage_collector_finds(begun, frozen, backend):
     """Autograd's nodes among it would belong to another stream than the one on which a CUDA graph is recorded."""
     _, scenes = scenes_of(begun[0])

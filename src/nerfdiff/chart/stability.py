@@ -43,6 +43,7 @@ def _study(study: Study, page: Path, views: int) -> dict[str, Any]:
         "rules": RULES,
         "strategies": strategies,
         "silent": study.silent,
+        "silent_lost": study.silent_lost,
         "broken": study.broken,
         "clean": {name: round(value, 2) for name, value in study.clean.items()},
         "axes": axes,

@@ -43,6 +43,7 @@ class ViewBatch:
         source_views, target_views: names of the views within their scenes.
         target_depth: ground-truth z-depth, 0 where nothing was hit; None where unknown or not asked for.
         target_mask: ground-truth foreground; None where unknown or not asked for.
+        soft_pixels: the source before it was sharpened (`nerfdiff.stability.mend`); None where it was not.
     """
 
     draws: Int64[Tensor, " batch"]
@@ -57,6 +58,7 @@ class ViewBatch:
     target_views: tuple[tuple[str, ...], ...]
     target_depth: Float[Tensor, "batch targets height width"] | None = None
     target_mask: Bool[Tensor, "batch targets height width"] | None = None
+    soft_pixels: UInt8[Tensor, "batch 3 height width"] | None = None
 
     @staticmethod
     def collate(samples: Sequence[Sample]) -> "ViewBatch":

@@ -115,6 +115,8 @@ class NGDModule(LightningModule):
         same = self.settings.guidance(self._renderer) == self._renderer and not self.keeps_coarse
         self._rendered: SceneImages | None = self._first if same else None
         self._first_source = self._render_source()
+        self._seen: tuple[SceneImages, Tensor] | None = None
+        self._seen_times = 0
         self._finite = torch.ones(len(self.field), dtype=torch.bool, device=self.device)
         self._finite_on_host = torch.ones(len(self.field), dtype=torch.bool, pin_memory=self.device.type == "cuda")
         self._fitted = self.cameras
@@ -201,7 +203,7 @@ class NGDModule(LightningModule):
         for scene, (finite, diverged) in enumerate(zip(self._finite.tolist(), worse.tolist(), strict=True)):
             self.statuses[scene] = "non-finite" if not finite else "diverged" if diverged else "ok"
         # module and Trainer hold each other: free the largest tensors now
-        del self._inner, self._batches, self._rendered, self._first, self._first_source
+        del self._inner, self._batches, self._rendered, self._first, self._first_source, self._seen
 
     def trace(self, scene: int) -> list[Step]:
         """Return one scene's record, step by step. Waits for the device."""
@@ -332,11 +334,47 @@ class NGDModule(LightningModule):
         if self._rendered is None:
             cameras = self._fitted if self.keeps_coarse else self.cameras
             cameras = self._chosen_of(cameras, fitted=self.keeps_coarse)
-            rendering = self._render(cameras, self.settings.guidance(self._renderer), self.keeps_coarse)
+            renderer = self.settings.guidance(self._renderer)
+            leaves_empty = renderer.skip != "none" and self.settings.empty_below > 0
+            if leaves_empty and self._chosen is None and not self.keeps_coarse:
+                return self._render_again(renderer)
+            rendering = self._render(cameras, renderer, self.keeps_coarse)
             if rendering.coarse is not None:
                 self._batches.set_coarse(rendering.coarse.repeat_interleave(self._split, -1) / self._split)
             views = self.cameras.shape[1] if self._chosen is None else self._chosen.shape[1]
             self._rendered = self._of_all_views(rendering.images[:, :views])
+        return self._rendered
+
+    @torch.no_grad()
+    def _render_again(self, renderer: Renderer) -> SceneImages:
+        """Render the virtual views' pixels that are not empty (`FitSettings.empty_below`). Waits for the device."""
+        settings, times = self.settings, self._seen_times
+        self._seen_times += 1
+        if times % settings.whole_every == 0:
+            whole = self._render(self.cameras, renderer)
+            self._seen = whole.images, whole.opacity
+        else:
+            images, opacity = self._seen
+            side = 2 * settings.empty_reach + 1
+            near = (F.max_pool2d(opacity, side, 1, settings.empty_reach) >= settings.empty_below).flatten(1)
+            # the same number in each scene: where one has fewer, some that are empty are rendered, and not taken
+            picked = near.sort(dim=1, descending=True, stable=True).indices[:, : int(near.sum(1).max())]
+            rendering = renderer.render(self.field.field(), self._batches.at(picked)[0])
+            for views in self.views:
+                views.field_queries += renderer.samples_per_ray * picked.shape[1]
+
+            def put(values: Tensor, rendered: Tensor) -> Tensor:
+                each = picked[..., None].expand(rendered.shape)
+                taken = torch.where(
+                    near.gather(1, picked)[..., None], rendered.to(values.dtype), values.gather(1, each)
+                )
+                return values.scatter(1, each, taken)
+
+            colours = put(images.movedim(2, -1).flatten(1, 3), rendering.rgb)
+            images = colours.reshape(*opacity.shape, 3).movedim(-1, 2)
+            opacity = put(opacity.flatten(1)[..., None], rendering.opacity[..., None]).reshape(opacity.shape)
+            self._seen = images, opacity
+        self._rendered = self._seen[0]
         return self._rendered
 
     @property

@@ -45,11 +45,13 @@ class FitSettings:
         patience: steps in which the field's renderings agree no better with the denoised images, after which what is
             left of the schedule is one step; None: all steps are taken.
         rise: dB by which they have to agree better.
+        empty_below: opacity below which a pixel of a rendering for the teacher is empty. It keeps its colour where all
+            within `empty_reach` pixels of it are, but for every `whole_every`-th rendering. 0 renders all every time.
         views_last: number of virtual views that are left at the last step, see `VirtualViews.choose`; None keeps all.
 
     Raises:
-        ConfigError: another `lr_decay` or `coarse`, no rays, negative steps, shares outside [0, 1], or no view or
-            uniform samples.
+        ConfigError: another `lr_decay` or `coarse`, no rays, negative steps, shares or opacities outside [0, 1], or no
+            view or uniform samples.
     """
 
     inner_steps: int
@@ -71,6 +73,9 @@ class FitSettings:
     steps_share: float = 1.0
     patience: int | None = None
     rise: float = 0.0
+    empty_below: float = 0.0
+    empty_reach: int = 2
+    whole_every: int = 4
 
     def __post_init__(self):
         if self.rays < 1 or self.inner_steps < 0:
@@ -88,6 +93,13 @@ class FitSettings:
                 raise ConfigError(f"strategy.{name}={getattr(self, name)}: expected a share above 0, to 1")
         if self.patience is not None and self.patience < 1:
             raise ConfigError(f"strategy.patience={self.patience} must be at least 1; null takes all steps")
+        if not 0 <= self.empty_below < 1:
+            raise ConfigError(f"strategy.empty_below={self.empty_below}: expected an opacity from 0 to less than 1")
+        if self.empty_reach < 0 or self.whole_every < 1:
+            raise ConfigError(
+                f"strategy.empty_reach={self.empty_reach} must be at least 0 and "
+                f"strategy.whole_every={self.whole_every} at least 1"
+            )
         if self.views_last is not None and self.views_last < 1:
             raise ConfigError(f"strategy.views_last={self.views_last} must be at least 1; null keeps all views")
         for name, least in (("uniform", 1), ("importance", 0)):

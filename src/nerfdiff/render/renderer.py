@@ -85,6 +85,7 @@ class Renderer:
             0 follows rays to their ends, as the reference does.
         skip: what a CPU leaves out of the backward pass of a triplane: `none`, or `faint`: samples whose gradients
             together are less than a thousandth of all (`field.cpu_field.Faint`). Renderings are the same, bit for bit.
+            A distillation with `faint` also leaves empty pixels of its own renderings as they were.
 
     Raises:
         ConfigError: another `backend`, `kernel_precision` or `skip`, or a `least_transmittance` outside [0, 1).

@@ -91,6 +91,32 @@ def contact_sheet(
     return path
 
 
+def labelled_sheet(
+    path: str | Path, cells: Mapping[str, Float[Tensor, "3 h w"]], across: int = 2, factor: int = 4, gap: int = 8
+) -> Path:
+    """Save a PNG of pictures in [0, 1] under their labels, enlarged by a whole factor, so many in a line.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
+    pixels = _enlarged(quantise(torch.stack(list(cells.values()))).cpu(), factor)
+    height, width = pixels.shape[1:3]
+    font = ImageFont.load_default(size=max(12, height // 16))
+    text = 2 * max(12, height // 16)
+    width = max(width, *(math.ceil(font.getlength(label)) for label in cells))
+    lines = math.ceil(len(cells) / across)
+    sheet = Image.new("RGB", (across * (width + gap), lines * (height + text + gap)), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    for number, (label, image) in enumerate(zip(cells, pixels, strict=True)):
+        x, y = number % across * (width + gap), number // across * (height + text + gap)
+        draw.text((x, y + text / 2), label, INK, font, anchor="lm")
+        sheet.paste(Image.fromarray(image), (x, y + text))
+    path = Path(path)
+    with atomic(path) as temporary:
+        sheet.save(temporary)
+    return path
+
+
 def orbit_video(path: str | Path, frames: Float[Tensor, "n 3 h w"], fps: int | float = 25, min_size: int = 256) -> Path:
     """Save frames in [0, 1] as an H.264 mp4 that any player shows (yuv420p).
 

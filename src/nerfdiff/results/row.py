@@ -148,6 +148,7 @@ class ResultRow(make_dataclass("_Measured", _NUMBERS, bases=(_Identity,), kw_onl
     verdict: str | None = None
     nonfinite_grad_steps: int | None = None
     loss_spikes: int | None = None
+    held_out_loss: float | None = None
     grad_norm_p99: float | None = None
 
     def __post_init__(self) -> None:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -58,6 +58,27 @@ Outcomes = Mapping[tuple[int, str], Outcome]
 
 
 @dataclass(frozen=True)
+class Failure:
+    """A scene that rule b or c holds for, by itself.
+
+    Args:
+        rules: b, c or both.
+        loss: against its own clean result, in dB; None for other scenes.
+        harm: against `none` at the same severity, in dB; None for `none` itself.
+        clean_harm: against `none` without stress, in dB; None where it is not known.
+        told: a user is told that something is wrong. If not, the failure is silent.
+    """
+
+    seed: int
+    scene: str
+    rules: str
+    loss: float | None
+    harm: float | None
+    clean_harm: float | None
+    told: bool
+
+
+@dataclass(frozen=True)
 class Point:
     """A strategy at one severity of an axis.
 
@@ -68,8 +89,7 @@ class Point:
         failed, total: scenes (times seeds) that fell back, are not finite or have no result, of how many.
         suspect: scenes that the judge suspects.
         broken: the rules (a to d) that hold.
-        broken_scenes: (seed, scene) that rule b or c holds for, by itself.
-        silent: those of them that nobody is told of.
+        failures: scenes that rule b or c holds for, by themselves.
         frechet: mean over seeds; None where it was not measured.
     """
 
@@ -81,9 +101,13 @@ class Point:
     total: int
     suspect: int
     broken: str
-    broken_scenes: tuple[tuple[int, str], ...]
-    silent: tuple[tuple[int, str], ...]
+    failures: tuple[Failure, ...]
     frechet: float | None
+
+    @property
+    def silent(self) -> tuple[Failure, ...]:
+        """Those failures that nobody is told of."""
+        return tuple(failure for failure in self.failures if not failure.told)
 
 
 @dataclass(frozen=True)
@@ -125,6 +149,7 @@ class Judged:
     Args:
         clean: its own without stress; empty where the scenes are others.
         none: of strategy `none` at the same severity; empty for `none` itself.
+        clean_none: of strategy `none` without stress, likewise.
         baseline: PSNR of the better baseline, by scene.
         frechet, clean_frechet: Fréchet distances, one per seed.
     """
@@ -136,6 +161,7 @@ class Judged:
     baseline: Mapping[str, float]
     frechet: Sequence[float] = ()
     clean_frechet: Sequence[float] = ()
+    clean_none: Outcomes = field(default_factory=dict)
 
 
 def point_of(judged: Judged, rules: Rules, bootstrap: Bootstrap) -> Point:
@@ -144,7 +170,6 @@ def point_of(judged: Judged, rules: Rules, bootstrap: Bootstrap) -> Point:
     measured = {key: outcome.psnr for key, outcome in outcomes.items() if math.isfinite(outcome.psnr)}
     sound = [outcome.psnr for outcome in outcomes.values() if not outcome.failed]
     losses = _paired(judged.clean, outcomes)
-    broken = _broken_scenes(judged, rules)
     holds = _holding(judged, rules, None)
     return Point(
         severity=judged.severity,
@@ -155,8 +180,7 @@ def point_of(judged: Judged, rules: Rules, bootstrap: Bootstrap) -> Point:
         total=len(outcomes),
         suspect=sum((outcome.verdict or "ok") != "ok" for outcome in outcomes.values()),
         broken="".join(rule for rule, true in holds.items() if bool(np.all(true))),
-        broken_scenes=tuple(broken),
-        silent=tuple(key for key in broken if not outcomes[key].told),
+        failures=tuple(_failures(judged, rules)),
         frechet=float(np.mean(judged.frechet)) if judged.frechet else None,
     )
 
@@ -180,7 +204,8 @@ def breaking_point(side: str, along: Sequence[Judged], rules: Rules, bootstrap: 
     if at is not None:
         judged = along[at]
         failed = [key for key, outcome in judged.outcomes.items() if outcome.failed]
-        found = sorted({*failed, *_broken_scenes(judged, rules)}) or sorted(judged.outcomes)
+        broken = [(failure.seed, failure.scene) for failure in _failures(judged, rules)]
+        found = sorted({*failed, *broken}) or sorted(judged.outcomes)
         scene = found[0][1] if found else None
     return Breaking(
         side=side,
@@ -229,17 +254,22 @@ def _holding(judged: Judged, rules: Rules, bootstrap: Bootstrap | None) -> dict[
     return {rule: np.broadcast_to(value, size) for rule, value in holds.items()}
 
 
-def _broken_scenes(judged: Judged, rules: Rules) -> list[tuple[int, str]]:
-    """List the scenes that rule b or c holds for by themselves."""
-    broken = []
-    for key, outcome in sorted(judged.outcomes.items()):
-        under = judged.baseline.get(key[1], -math.inf)
-        clean = judged.clean[key].psnr - rules.clean if key in judged.clean else -math.inf
-        none = _of(judged.none, key)
-        harm = -math.inf if none is None else none - rules.harm
-        if outcome.psnr < under or outcome.psnr <= clean or outcome.psnr <= harm:
-            broken.append(key)
-    return broken
+def _failures(judged: Judged, rules: Rules) -> list[Failure]:
+    """List the scenes that rule b or c holds for by themselves; those without a result have neither loss nor harm."""
+    found = []
+    for (seed, scene), outcome in sorted(judged.outcomes.items()):
+        own, none, clean_none = (
+            _of(outcomes, (seed, scene)) for outcomes in (judged.clean, judged.none, judged.clean_none)
+        )
+        loss = None if own is None else own - outcome.psnr
+        harm = None if none is None else none - outcome.psnr
+        clean_harm = None if own is None or clean_none is None else clean_none - own
+        under = outcome.psnr < judged.baseline.get(scene, -math.inf)
+        broken = {"b": under or (loss or 0) >= rules.clean, "c": (harm or 0) >= rules.harm}
+        if any(broken.values()):
+            rule = "".join(name for name, holds in broken.items() if holds)
+            found.append(Failure(seed, scene, rule, loss, harm, clean_harm, outcome.told))
+    return found
 
 
 def _of(outcomes: Outcomes, key: tuple[int, str]) -> float | None:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool
@@ -75,7 +75,7 @@ class Judge:
     def signs(
         self, model: NerfDiff, scene: ViewBatch, predicted: PredictedViews, familiar: Familiar | None, seed: int
     ) -> dict[str, float]:
-        """Measure the signs of one scene.
+        """Measure the signs of one scene; facts of its input are those before it was sharpened.
 
         Args:
             predicted: views of `scene.target_cameras`.
@@ -83,7 +83,8 @@ class Judge:
         """
         mask = object_mask(scene.source[0])
         encoding = model.encode(scene)
-        found = {} if familiar is None else familiar.beyond(scene)
+        given = scene if scene.soft_pixels is None else replace(scene, source_pixels=scene.soft_pixels)
+        found = {} if familiar is None else familiar.beyond(given)
         if familiar is not None and (of_input := features(encoding)) is not None:
             found["unlike"] = float(familiar.distance(of_input)[0])
         chosen = spread(len(predicted.images), self.views)

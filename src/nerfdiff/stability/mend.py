@@ -46,13 +46,21 @@ class Mend:
     strengths: Sequence[float]
 
     def __call__(self, scene: ViewBatch) -> ViewBatch:
-        """Return a batch of one scene with its input mended; the batch itself where nothing had to be done."""
-        image, done = self.picture(scene.source[0].cpu())
+        """Return a batch of one scene with its input mended; the batch itself where nothing had to be done.
+
+        Sharpening does not bring back what is gone: the picture before it stays as `soft_pixels`, for the judge.
+        """
+        soft, strength, done = self.picture(scene.source[0].cpu())
         if not done:
             return scene
         log.warning("the input of %s was mended: %s (mend_input=false leaves it)", scene.scene_ids[0], ", ".join(done))
-        pixels = (image * 255).round().byte()[None].to(scene.source_pixels.device)
-        return replace(scene, source_pixels=pixels)
+
+        def pixels(image: Picture) -> torch.Tensor:
+            return (image * 255).round().byte()[None].to(scene.source_pixels.device)
+
+        if not strength:
+            return replace(scene, source_pixels=pixels(soft))
+        return replace(scene, source_pixels=pixels(sharpened(soft, strength)), soft_pixels=pixels(soft))
 
     @property
     def identity(self) -> list[Any]:
@@ -60,12 +68,12 @@ class Mend:
         ranges = sha256_values(self.familiar.ranges.tolist())
         return [ranges, self.beyond, self.most_peeled, list(self.strengths)]
 
-    def picture(self, image: Picture) -> tuple[Picture, list[str]]:
-        """Return a picture on white as the training images are, and what was done."""
+    def picture(self, image: Picture) -> tuple[Picture, float, list[str]]:
+        """Return a picture cut out as the training images are, by how much to sharpen it, and what is done to it."""
         done: list[str] = []
         beyond = self.familiar.picture_beyond
         if not object_mask(image).any() or max(beyond(image).values()) <= self.beyond:
-            return image, done
+            return image, 0.0, done
         clean = _on_white(image, _without_specks(object_mask(image)))
         if sum(beyond(clean).values()) < sum(beyond(image).values()):
             image = clean
@@ -76,9 +84,8 @@ class Mend:
             pixels = "1 pixel of the object's edge was" if peeled == 1 else f"{peeled} pixels of the object's edge were"
             done.append(f"{pixels} removed")
         if strength:
-            image = _sharpened(image, strength)
             done.append(f"it was sharpened by {strength:g}")
-        return image, done
+        return image, strength, done
 
     def _edge_and_sharpness(self, image: Picture) -> tuple[int, float]:
         """Return how many pixels to peel off, and by how much to sharpen then: the fewest with which both are usual.
@@ -92,7 +99,7 @@ class Mend:
                 break
             peeled = _on_white(image, left)
             strength = self._strength(peeled)
-            if self._usual(_sharpened(peeled, strength), (*EDGE, "size", "share", "sharpness", "steepness")):
+            if self._usual(sharpened(peeled, strength), (*EDGE, "size", "share", "sharpness", "steepness")):
                 return pixels, strength
         return 0, self._strength(image)
 
@@ -101,7 +108,7 @@ class Mend:
         usual = self.familiar.usual_value("sharpness")
         if of_picture(image)["sharpness"] > usual or self._usual(image, ("sharpness", "steepness")):
             return 0.0
-        return min((0.0, *self.strengths), key=lambda s: abs(of_picture(_sharpened(image, s))["sharpness"] - usual))
+        return min((0.0, *self.strengths), key=lambda s: abs(of_picture(sharpened(image, s))["sharpness"] - usual))
 
     def _usual(self, image: Picture, names: Sequence[str]) -> bool:
         beyond = self.familiar.picture_beyond(image)
@@ -125,8 +132,8 @@ def _on_white(image: Picture, mask: Bool[Tensor, "height width"]) -> Picture:
     return torch.where(mask, image, torch.ones(()))
 
 
-def _sharpened(image: Picture, strength: float) -> Picture:
-    """Add so many times the difference to a picture softened by a binomial filter of 3 × 3."""
+def sharpened(image: Picture, strength: float) -> Picture:
+    """Add so many times the difference to a picture softened by a binomial filter of 3 × 3: an unsharp mask."""
     row = torch.tensor([0.25, 0.5, 0.25])
     kernel = (row[:, None] * row).expand(3, 1, 3, 3)
     soft = F.conv2d(F.pad(image[None], [1] * 4, mode="replicate"), kernel, groups=3)[0]

@@ -26,6 +26,8 @@ from nerfdiff.stability.breaking import (
 log = logging.getLogger(__name__)
 
 SWEPT = ("stress", "stress.severity", "strategy", "seed")
+PLACES = ("paths.runs_dir", "paths.output_dir", "run_name", "results", "threads", "data.cache_dir", "data.num_workers")
+"""Overrides that say where runs were made, and not what."""
 BASELINES = ("copy_input", "mean_image")
 CLEAN = "none"
 
@@ -54,7 +56,7 @@ class Verdict:
 
     @property
     def broken(self) -> int:
-        return sum(len(point.broken_scenes) for point in self.points)
+        return sum(len(point.failures) for point in self.points)
 
 
 @dataclass(frozen=True)
@@ -79,12 +81,24 @@ class Study:
         return sum(verdict.silent for verdict in self.verdicts)
 
     @property
+    def silent_lost(self) -> int:
+        """Silent failures of rule b; the others are of rule c alone."""
+        points = (point for verdict in self.verdicts for point in verdict.points)
+        return sum("b" in failure.rules for point in points for failure in point.silent)
+
+    @property
     def broken(self) -> int:
         return sum(verdict.broken for verdict in self.verdicts)
 
 
+def seed_of(run: Run) -> int:
+    """Return the seed that a run was asked for: the stress `seed` gives it another."""
+    asked = [word.partition("=")[2] for word in run.row.overrides or () if word.startswith("seed=")]
+    return int(asked[-1]) if asked and asked[-1].isdecimal() else run.row.seed or 0
+
+
 def studies(runs: Iterable[Run], axes: Mapping[str, DictConfig], rules: Rules, bootstrap: Bootstrap) -> list[Study]:
-    """Judge the runs of sweeps of stresses; others are left out.
+    """Judge the runs of sweeps of stresses, which may lie in several folders, as one seed each; others are left out.
 
     Args:
         runs: oldest first; the newest of the same job counts.
@@ -92,8 +106,9 @@ def studies(runs: Iterable[Run], axes: Mapping[str, DictConfig], rules: Rules, b
     """
     jobs: dict[tuple, dict[tuple, Run]] = {}
     for run in runs:
-        rest = tuple(sorted(w for w in run.row.overrides or () if w.lstrip("+").partition("=")[0] not in SWEPT))
-        key = run.row.stress, run.row.severity, run.row.strategy, run.row.seed
+        words = run.row.overrides or ()
+        rest = tuple(sorted(w for w in words if w.lstrip("+").partition("=")[0] not in (*SWEPT, *PLACES)))
+        key = run.row.stress, run.row.severity, run.row.strategy, seed_of(run)
         jobs.setdefault(rest, {})[key] = run
     found = [_study(settings, list(own.values()), axes, rules, bootstrap) for settings, own in jobs.items()]
     return [study for study in found if study.verdicts]
@@ -127,6 +142,7 @@ def _study(
                     own if others else baseline,
                     _frechet(by_point[axis, severity, strategy]),
                     [] if others else _frechet(clean_runs.get(strategy, ())),
+                    {} if others or strategy == "none" else clean.get("none", {}),
                 )
     points = {
         key: {severity: point_of(each, rules, bootstrap) for severity, each in own.items()}
@@ -201,7 +217,7 @@ def _outcomes(runs: Sequence[Run], scenes: Sequence[str]) -> Outcomes:
         if not own:
             status = run.row.status if run.row.status not in ("ok", None) else "error"
             own = {scene: Outcome(math.nan, status) for scene in scenes or ("?",)}
-        found |= {(run.row.seed or 0, scene): outcome for scene, outcome in own.items()}
+        found |= {(seed_of(run), scene): outcome for scene, outcome in own.items()}
     return found
 
 

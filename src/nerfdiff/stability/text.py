@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 from nerfdiff.results.row import ResultRow
 from nerfdiff.results.text import markdown_lines, one_line
 from nerfdiff.stability.breaking import Breaking
+from nerfdiff.stability.judge import OK
 from nerfdiff.stability.study import Study, Verdict
 
 RULES = (
@@ -92,12 +93,12 @@ def _lines(study: Study) -> list[list[str]]:
         for point in verdict.points:
             loss = point.loss
             ends = "" if loss is None or loss.low is None else f" [{loss.low:.2f}, {loss.high:.2f}]"
-            first = min((scene for _, scene in point.broken_scenes), default="–")
+            first = min((failure.scene for failure in point.failures), default="–")
             rows.append(
                 [
                     *(stress.name, verdict.strategy, severity_text(stress, point.severity)),
-                    _number(point.psnr.mean),
-                    _number(point.without_fallbacks),
+                    number_text(point.psnr.mean),
+                    number_text(point.without_fallbacks),
                     "–" if loss is None else f"{loss.mean:.2f}{ends}",
                     *(f"{point.failed} of {point.total}", str(point.suspect), point.broken or "–"),
                     *(str(len(point.silent)), first),
@@ -106,8 +107,12 @@ def _lines(study: Study) -> list[list[str]]:
     return rows
 
 
-def _number(value: float | None) -> str:
+def number_text(value: float | None) -> str:
+    """Two digits after the point, or a dash where there is no finite number."""
     return "–" if value is None or not math.isfinite(value) else f"{value:.2f}"
+
+
+COUNTS = ("loss_spikes", "nonfinite_grad_steps", "grad_norm_p99")
 
 
 def training_markdown(rows: Sequence[ResultRow], axes: Mapping[str, DictConfig]) -> str:
@@ -116,8 +121,8 @@ def training_markdown(rows: Sequence[ResultRow], axes: Mapping[str, DictConfig])
     for row in rows:
         groups.setdefault((row.stress or "none", row.severity), []).append(row)
     table = [
-        ["stress", "severity", "held-out PSNR, dB", "against clean", "spikes", "steps without a gradient"]
-        + ["99 % of gradient norms", "recovered", "runs that ended"]
+        ["stress", "severity", "held-out PSNR, dB", "against clean", "CDM's held-out loss", "spikes"]
+        + ["steps without a gradient", "99 % of gradient norms", "recovered", "suspect", "runs that ended"]
     ]
     clean = _mean([row.psnr for row in groups.get(("none", None), ())])
     for (axis, severity), own in sorted(
@@ -125,31 +130,39 @@ def training_markdown(rows: Sequence[ResultRow], axes: Mapping[str, DictConfig])
     ):
         psnr = _mean([row.psnr for row in own])
         upset = [row for row in own if row.loss_spikes or row.nonfinite_grad_steps]
-        recovered = f"{sum(row.status == 'ok' for row in upset)} of {len(upset)}" if upset else "–"
+        recovered = (
+            f"{sum(row.status == 'ok' and (row.verdict or OK) == OK for row in upset)} of {len(upset)}"
+            if upset
+            else "–"
+        )
         stress = axes.get(axis)
         table.append(
             [
                 stress.name if stress is not None else axis,
                 severity_text(stress, severity) if stress is not None else "–",
-                _number(psnr),
+                _with_spread([row.psnr for row in own]),
                 "–" if psnr is None or clean is None else f"{psnr - clean:+.2f}",
-                *(
-                    _number(_mean([getattr(row, key) for row in own]))
-                    for key in ("loss_spikes", "nonfinite_grad_steps")
-                ),
-                _number(_mean([row.grad_norm_p99 for row in own])),
+                _with_spread([row.held_out_loss for row in own], 4),
+                *(number_text(_mean([getattr(row, key) for row in own])) for key in COUNTS),
                 recovered,
+                f"{sum((row.verdict or OK) != OK for row in own)} of {len(own)}",
                 f"{sum(row.status == 'ok' for row in own)} of {len(own)}",
             ]
         )
     said = (
-        "Means over seeds of runs that ended. A run has recovered if it had spikes or steps without a gradient, and "
-        "ended with its losses finite."
+        "Means over seeds, ± their standard deviation where there are several. A run is suspect if its held-out "
+        "renderings are no better than pictures of one even colour. It has recovered if it had spikes or steps without "
+        "a gradient, ended, and is not suspect."
     )
     return f"# Stability of training\n\n{said}\n\n{markdown_lines(table)}"
 
 
-COUNTS = ("loss_spikes", "nonfinite_grad_steps", "grad_norm_p99")
+def _with_spread(values: Sequence[float | None], digits: int = 2) -> str:
+    known = [value for value in values if value is not None and math.isfinite(value)]
+    if not known:
+        return "–"
+    spread = f" ± {np.std(known, ddof=1):.{digits}f}" if len(known) > 1 else ""
+    return f"{np.mean(known):.{digits}f}{spread}"
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

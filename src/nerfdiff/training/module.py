@@ -112,16 +112,19 @@ class NerfDiffModule(LightningModule):
         encoding = self.model.encode(batch)
         rendering = self.model.render(encoding, batch.target_cameras)
         rendered = rendering.images
+        truth = batch.targets.flatten(0, 1)
+        even = truth.mean((-2, -1), keepdim=True).expand_as(truth)  # what a field that collapsed is no better than
         self.log_dict(
             {
-                "val/psnr": psnr(rendered.flatten(0, 1), batch.targets.flatten(0, 1)).mean(),
+                "val/psnr": psnr(rendered.flatten(0, 1), truth).mean(),
+                "val/psnr_even": psnr(even, truth).mean(),
                 "val/loss_ic": F.mse_loss(rendered, batch.targets),
             },
             batch_size=len(batch),
             sync_dist=True,
         )
         condition = self.model.condition(encoding, batch.target_cameras, rendered)
-        targets = to_signed(batch.targets.flatten(0, 1))
+        targets = to_signed(truth)
         eps = torch.randn(targets.shape, generator=generator("cpu", self.hparams.seed, "validation", batch_idx))
         losses = [
             self._denoising_loss(condition, targets, eps.to(targets), targets.new_full((len(targets),), t))

@@ -33,13 +33,14 @@ from nerfdiff.exported_model import export_model
 from nerfdiff.inputs import LAST, find_weights
 from nerfdiff.model import settings_of
 from nerfdiff.processes import lost_process, watch
+from nerfdiff.stability.judge import OK
 from nerfdiff.stopping import Stopped
 from nerfdiff.stress.stress import stress_of, stressed_readers, with_stress
 from nerfdiff.training.callbacks.checkpoint import ClearCheckpointIO
 from nerfdiff.training.callbacks.record import Record
 from nerfdiff.training.memory import WEIGHTS_ADAM_EMA, is_tight, within_memory
 from nerfdiff.training.module import NerfDiffModule
-from nerfdiff.training.rows import append_training_row
+from nerfdiff.training.rows import append_training_row, verdict
 from nerfdiff.utils.config import auto_precision, plain
 from nerfdiff.utils.errors import CheckpointError, ConfigError, ProcessLost, TrainingDiverged
 from nerfdiff.utils.files import held, remove_leftovers
@@ -131,6 +132,8 @@ def _train(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
         loaded = load_model(last_checkpoint(output_dir), weights, cfg.paths.assets_dir)
         path = export_model(loaded, output_dir / "model", torch.float32)
         log.info("weights: %s", path)
+        if (said := verdict(trainer.callback_metrics)) not in (None, OK):
+            log.warning("this training is %s", said)
         log.info("previews: %s   curves: tensorboard --logdir %s", output_dir / "previews", output_dir)
     return {name: float(value) for name, value in trainer.callback_metrics.items()}
 

@@ -24,9 +24,9 @@ function drawStability() {
 
 function showStudy(number) {
   study = data.stability[number];
-  const { silent, broken } = study;
+  const { silent, silent_lost: lost, broken } = study;
   $("silent").className = silent ? "bad" : "";
-  const told = "with status ok, and the judge said ok";
+  const told = `with status ok, and the judge said ok; ${lost} by rule (b), ${silent - lost} by rule (c) alone`;
   $("silent").replaceChildren(element("b", {}, `Silent failures: ${silent} of ${broken} broken scenes`), silent ? ` (${told})` : "");
   $("curve-box").hidden = true;
   const head = element("tr", {}, element("th", { scope: "col" }, "axis"), ...study.strategies.map((name) => element("th", { scope: "col" }, name)));

@@ -57,7 +57,7 @@ def test_bricks_are_no_object(tmp_path):
 
 
 def test_a_box_says_which_object_is_meant(tmp_path):
-    photograph(*wagon(), tmp_path / "a.png", (300, 400), (0.25, 0.55), 0.5, 3)
+    photograph(*wagon(), tmp_path / "a.png", (300, 400), (0.25, 0.55), 0.5, 0)
     both = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")) / 255
     truth = photograph(*wagon(), tmp_path / "two.png", (300, 400), (0.75, 0.5), 0.5, 0, both)
     rows, columns = (np.flatnonzero(truth.any(axis)) for axis in (1, 0))

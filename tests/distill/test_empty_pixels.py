@@ -21,7 +21,7 @@ def net(skip="faint"):
 
 @pytest.fixture
 def seen(monkeypatch):
-    """What was rendered for the teacher at each step: what it is, and what a whole rendering would be."""
+    """Record each rendering for the teacher: what was seen before, what it shows, and a rendering of all pixels."""
     calls = []
     plain = NGDModule._render_again
 

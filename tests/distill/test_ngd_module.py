@@ -16,9 +16,6 @@ from nerfdiff.distill.ngd import Guidance, NGDTeacher
 from nerfdiff.distill.sds import SDSTeacher
 from nerfdiff.distill.stochastic import StochasticTeacher
 from nerfdiff.fit.objective import Objective
-from nerfdiff.fit.ray_batches import RayBatches
-from nerfdiff.fit.refined_field import RefinedField
-from nerfdiff.fit.settings import COARSE
 from nerfdiff.utils.errors import ConfigError
 
 
@@ -193,23 +190,6 @@ def test_settings_of_the_fit_that_cannot_be_are_refused():
             distillation(TEACHERS["ngd"], **options)
 
 
-def test_a_scene_that_fails_leaves_the_others_alone():
-    net = model().requires_grad_(False)
-
-    def ruined(views):
-        teacher = TEACHERS["direct"](views)
-        if views.seed[-1] == "b":
-            teacher.images = teacher.images * float("nan")
-        return teacher
-
-    module = distillation(ruined).distil(net, [scene("a"), scene("b")], seed=0)
-    alone = distillation(TEACHERS["direct"]).distil(net, [scene("a")], seed=0)
-    assert module.statuses == ["ok", "non-finite"] and bool(module.field.finite().all())
-    torch.testing.assert_close(module.field.planes[:1], alone.field.planes)
-    start = net.encode(scene()).triplane.planes
-    assert torch.equal(module.field.planes[1:], start)  # it failed at once: what was good is where it began
-
-
 def test_no_virtual_views_are_refused():
     none = dataclasses.replace(distillation(TEACHERS["ngd"]), prior=lambda s: prior(1)(s)[:, :0])
     with pytest.raises(ConfigError, match=r"no virtual views: set budget\.views"):
@@ -250,62 +230,6 @@ def test_learning_rates_fall_with_the_steps(decay, factors, monkeypatch):
     monkeypatch.setattr(NGDModule, "_fit", watched)
     distillation(TEACHERS["ngd"], lr_decay=decay).distil(model().requires_grad_(False), [scene()], seed=0)
     assert rates == [pytest.approx([1e-2 * factor, 1e-4 * factor]) for factor in factors]
-
-
-@pytest.mark.parametrize("fit_source", [False, True])
-def test_coarse_weights_are_those_of_the_last_refresh(fit_source, monkeypatch):
-    """Inner steps are given the weights of the field that guidance rendered, ray by ray, and not of a later one."""
-    net = model(conditioning={"residual_std": 0.2}).requires_grad_(False)
-    renderings, checked = [], []
-    render, at = RefinedField.render, RayBatches.coarse_at
-
-    def noted(self, *args, **kwargs):
-        renderings.append(render(self, *args, **kwargs))
-        return renderings[-1]
-
-    def compared(self, picked):
-        given = at(self, picked)
-        views = 4 if fit_source else 3
-        last = next(r.coarse for r in reversed(renderings) if r.coarse is not None)
-        assert last.shape == (1, views, 16, 16, net.renderer.uniform_samples)
-        assert torch.equal(given, last.flatten(1, 3)[:, picked[0]])
-        checked.append(last)
-        return given
-
-    monkeypatch.setattr(RefinedField, "render", noted)
-    monkeypatch.setattr(RayBatches, "coarse_at", compared)
-    method = distillation(TEACHERS["ngd"], coarse="refresh", fit_source=fit_source, inner_steps=3)
-    assert method.distil(net, [scene()], seed=0).statuses == ["ok"]
-    assert len(checked) == 4 * 3
-    assert not torch.equal(checked[0], checked[-1])
-
-
-def test_the_input_view_is_rendered_too_where_it_is_fitted():
-    net = model().requires_grad_(False)
-    queries = {
-        (coarse, fit_source): distillation(TEACHERS["ngd"], coarse=coarse, fit_source=fit_source)
-        .distil(net, [scene()], 0)
-        .views[0]
-        .field_queries
-        for coarse in COARSE
-        for fit_source in (False, True)
-    }
-    view = 16 * 16 * net.renderer.samples_per_ray
-    # what importance sampling needs of the first field's 3 views is not kept, so they are rendered again
-    assert queries["refresh", False] == queries["every_step", False] + 3 * view
-    assert queries["refresh", True] == queries["every_step", True] + (3 + 4) * view
-
-
-@pytest.mark.parametrize("teacher", ["direct", "stochastic"])
-def test_where_nothing_is_rendered_on_the_way_every_step_computes_its_own_coarse_weights(teacher):
-    net = model().requires_grad_(False)
-    every, kept = (distillation(TEACHERS[teacher], coarse=c).distil(net, [scene()], seed=0) for c in COARSE)
-    assert torch.equal(every.field.planes, kept.field.planes)
-
-
-def test_an_unknown_choice_of_coarse_weights_is_refused_with_the_known_ones():
-    with pytest.raises(ConfigError, match=r"strategy.coarse='never': choose every_step, refresh"):
-        distillation(TEACHERS["ngd"], coarse="never").distil(model().requires_grad_(False), [scene()], seed=0)
 
 
 def test_an_unknown_decay_is_refused_with_the_known_ones():
@@ -374,44 +298,6 @@ def test_an_unknown_choice_at_full_guidance_is_refused_with_the_known_ones():
         distilled("never")
 
 
-def test_renderings_for_the_teacher_have_samples_of_their_own(monkeypatch):
-    """And no others: those that decide about a fallback, and inner steps, have the model's."""
-    net = model().requires_grad_(False)
-    own = net.renderer.uniform_samples, net.renderer.importance_samples
-    seen, render = [], RefinedField.render
-
-    def noted(self, renderer, cameras, *args):
-        seen.append((renderer.uniform_samples, renderer.importance_samples))
-        return render(self, renderer, cameras, *args)
-
-    monkeypatch.setattr(RefinedField, "render", noted)
-    view, queries = 16 * 16, {}
-    for counts, used in (((None, None), own), ((3, 0), (3, 0)), ((own[0] + 1, 2), (own[0], 2))):
-        seen.clear()
-        fit = {"guidance_uniform_samples": counts[0], "guidance_importance_samples": counts[1]}
-        module = distillation(TEACHERS["ngd"], **fit).distil(net, [scene()], seed=0)
-        assert seen == [own] + (4 if counts[0] else 3) * [used] + 2 * [own]  # begun with the virtual views' renderings
-        queries[counts] = module.views[0].field_queries
-    assert queries[None, None] - queries[3, 0] == 3 * view * (3 * sum(own) - 4 * 3)
-    assert distillation(TEACHERS["direct"], **fit).distil(net, [scene()], seed=0).statuses == ["ok"]
-
-
-def test_kept_coarse_weights_of_fewer_samples_are_split_into_the_renderer_s_bins(monkeypatch):
-    net = model().requires_grad_(False)
-    given, at = [], RayBatches.coarse_at
-    monkeypatch.setattr(RayBatches, "coarse_at", lambda *a: given.append(at(*a)) or given[-1])
-    fewer = {"guidance_uniform_samples": 3, "guidance_importance_samples": 2, "coarse": "refresh"}
-    assert distillation(TEACHERS["ngd"], **fewer).distil(net, [scene()], seed=0).statuses == ["ok"]
-    weights = given[0].unflatten(-1, (3, 2))
-    assert torch.equal(weights[..., 0], weights[..., 1]) and 0 < weights.sum((-1, -2)).max() <= 1
-    uneven = distillation(TEACHERS["ngd"], coarse="refresh", guidance_uniform_samples=4)
-    with pytest.raises(ConfigError, match=r"guidance_uniform_samples=4 bins cannot be .* divisor of 6"):
-        uneven.distil(net, [scene()], seed=0)
-    for count in ({"guidance_uniform_samples": 0}, {"guidance_importance_samples": -1}):
-        with pytest.raises(ConfigError, match=f"strategy.{next(iter(count))}=.* must be at least"):
-            distillation(TEACHERS["ngd"], **count)
-
-
 def test_without_guidance_and_inner_steps_views_are_plain_samples():
     net = model(conditioning={"residual_std": 0.2}).requires_grad_(False)
     module = distillation(guided(0.0), inner_steps=0).distil(net, [scene()], seed=0)
@@ -427,90 +313,3 @@ def test_one_view_and_one_ray_give_numbers(gamma):
     net = model().requires_grad_(False)
     module = distillation(guided(gamma), views=1, rays=1).distil(net, [scene()], seed=0)
     assert bool(module.field.finite()) and module.statuses[0] in ("ok", "diverged")
-
-
-class Failing:
-    """The same images until a step, and from there on what is no image."""
-
-    t = weight = view_weights = gap = None
-    follows_field, steps = False, 6
-
-    def __init__(self, images, at, value=float("nan")):
-        self.images, self.at, self.value, self.asked = images, at, value, 0
-
-    def targets(self, step, rendered):
-        self.asked += 1
-        images = self.images.clone()
-        if step >= self.at:
-            images[-1, :, 0, 0] = self.value  # one pixel, which rays may miss
-        return images
-
-
-def starting_planes(net):
-    with torch.no_grad():
-        return net.encode(scene()).triplane.planes
-
-
-def test_a_field_that_blows_up_falls_back_to_the_last_finite_one():
-    net = model().requires_grad_(False)
-
-    class Poisoned(NGDTeacher):
-        def targets(self, step, rendered):
-            images = super().targets(step, rendered)
-            return images * float("nan") if step == 2 else images
-
-    poisoned = distillation(lambda v: Poisoned(v, 4, sampling(), Guidance("snr", 0.3, "current"), "first"))
-    module = poisoned.distil(net, [scene()], seed=0)
-    assert module.statuses == ["non-finite"] and bool(module.field.finite())
-    assert not torch.equal(module.field.planes, starting_planes(net)), "two steps that did no harm are kept"
-
-
-@pytest.mark.parametrize("tolerance", [0.1, 60.0])
-@pytest.mark.parametrize("at", [4, 99])
-def test_what_was_finite_before_it_failed_must_stand_the_same_test(tolerance, at):
-    """A teacher of random images ruins a field, whether it ends in numbers or not."""
-    net = model().requires_grad_(False)
-    noise = torch.rand(3, 3, 16, 16, generator=torch.Generator().manual_seed(0)).round()
-    white = dataclasses.replace(scene(), source_pixels=torch.full_like(scene().source_pixels, 255))
-    method = distillation(lambda v: Failing(noise, at), lr_planes=0.1, inner_steps=20, source_tolerance=tolerance)
-    module = method.distil(net, [white], seed=0)
-    assert module.statuses == ["non-finite" if at == 4 else "diverged" if tolerance < 1 else "ok"]
-    with torch.no_grad():
-        start = net.encode(white).triplane.planes
-    assert torch.equal(module.field.planes, start) == (tolerance < 1)
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-@pytest.mark.parametrize("at", [0, 3])
-def test_a_lost_scene_stops_computing_and_its_company_goes_on(at, value):
-    net = model().requires_grad_(False)
-    made = {}
-
-    def teacher(views):
-        made[views.seed[-1]] = Failing(views.first_renderings * 0.9, at if views.seed[-1] == "b" else 99, value)
-        return made[views.seed[-1]]
-
-    alone = distillation(teacher, rays=4).distil(net, [scene("b")], seed=0)
-    assert alone.statuses == ["non-finite"] and bool(alone.field.finite())
-    assert made["b"].asked == at + 1 == len(alone.trace(0))
-    assert torch.equal(alone.field.planes, starting_planes(net)) == (at == 0)
-    own = distillation(teacher, rays=4).distil(net, [scene("a")], seed=0)
-    both = distillation(teacher, rays=4).distil(net, [scene("b"), scene("a")], seed=0)
-    assert both.statuses == ["non-finite", "ok"] and (made["a"].asked, made["b"].asked) == (6, at + 1)
-    torch.testing.assert_close(both.field.planes[1:], own.field.planes)
-    torch.testing.assert_close(both.field.planes[:1], alone.field.planes)
-
-
-@pytest.mark.parametrize(("tolerance", "status"), [(0.0, "diverged"), (60.0, "ok")])
-def test_how_much_worse_is_worse_is_a_choice(tolerance, status):
-    net = model().requires_grad_(False)
-    method = distillation(TEACHERS["direct"], lr_planes=1e4, target_tolerance=tolerance, source_tolerance=60.0)
-    assert method.distil(net, [scene()], seed=0).statuses == [status]
-
-
-def test_a_field_made_worse_falls_back_to_where_it_began():
-    net = model().requires_grad_(False)
-    module = distillation(TEACHERS["direct"], lr_planes=1e4).distil(net, [scene()], seed=0)
-    with torch.no_grad():
-        start = net.encode(scene()).triplane.planes
-    assert module.statuses == ["diverged"] and torch.equal(module.field.planes, start)

@@ -69,7 +69,7 @@ def test_a_soft_picture_is_sharpened_towards_the_true_one(mend):
 
 
 def test_the_judge_sees_a_soft_picture_as_it_was_and_a_peeled_one_as_it_is(mend):
-    """What was sharpened is suspect all the same; what was cut out too large is as good as new."""
+    """Sharpened pictures stay out of range for the judge; peeled ones are within."""
     for number in range(1000, 1010):
         soft = mend(scene(photo.low_resolution(picture(number), 0.6, DRAWS)))
         peeled = mend(scene(cutout.mask_size(picture(number), 1, DRAWS, 0.4)))

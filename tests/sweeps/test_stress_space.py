@@ -133,7 +133,7 @@ def test_a_stress_acts_where_one_of_its_keys_is():
 
 
 def test_the_full_sweep_has_every_strategy_that_makes_a_field():
-    """Of variants of one strategy the best alone."""
+    """`stability=full` sweeps all strategies that make fields, without the variants of one."""
     no_field, variants = {"cdm", "copy_input", "mean_image"}, {"ngd_equation", "ngd_first", "sds_fresh"}
     known = {path.stem for path in (CONF / "strategy").glob("*.yaml")} - no_field - variants
     asked = OmegaConf.load(CONF / "stability" / "full.yaml").hydra.sweeper.params.strategy

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
-from scipy import ndimage, sparse
-from scipy.sparse.csgraph import dijkstra
-from scipy.sparse.linalg import spsolve
+from scipy import ndimage
 from skimage.color import rgb2lab
 from skimage.filters import threshold_otsu
 from skimage.morphology import convex_hull_image
 
 from nerfdiff.data.formats.images import decode_with_alpha
+from nerfdiff.data.random_walk import Mixture, RandomWalk, refined, shrunk
 from nerfdiff.utils.errors import ConfigError, DataError
 from nerfdiff.utils.files import atomic
 
@@ -126,7 +125,7 @@ class CutOut:
         return Mask(where, how, (*_doubts(path, where, self.box is not None), *doubts))
 
     def _window(self, shape: tuple[int, int]) -> tuple[tuple[slice, slice], Bool[np.ndarray, "rows columns"] | None]:
-        """The part of a picture that is looked at, and where in it the box is."""
+        """Return the part of a picture that is looked at, and where in it the box is."""
         if self.box is None:
             return (slice(None), slice(None)), None
         (height, width), (left, top, right, bottom) = shape, (round(edge) for edge in self.box)
@@ -151,7 +150,7 @@ class CutOut:
     def _by_colour(
         self, path: str | Path, pixels: UInt8[np.ndarray, "height width 3"], within: Bool[np.ndarray, "h w"] | None
     ) -> tuple[Bool[np.ndarray, "height width"], list[str]]:
-        """Where the object is, and what speaks against it."""
+        """Return where the object is, and in words why that may be wrong."""
         doubts = []
         if within is not None:
             found = self._fine(pixels, self._closer(pixels, within, 1.0)) & within
@@ -170,10 +169,10 @@ class CutOut:
         return found, doubts
 
     def _fine(self, pixels, share) -> Bool[np.ndarray, "height width"]:
-        return _main_part(_refined(pixels, share, self.fine))
+        return _main_part(refined(pixels, share, self.fine))
 
     def _closer(self, pixels, found, margin: float) -> Float[np.ndarray, "rows columns"]:
-        """Share of the object in each pixel, which lies within, or near, the hull of `found`.
+        """Return the share of the object in each pixel. It lies within, or near, the hull of `found`.
 
         Args:
             margin: how deep within the hull the object is as likely as not, in tenths of its size.
@@ -183,10 +182,10 @@ class CutOut:
         reach = 0.1 * np.sqrt(hull.sum())
         inside, outside = (ndimage.distance_transform_edt(part) / reach for part in (hull, ~hull))
         enclosed = (np.where(hull, (inside - margin).clip(-1, 1.5), 0) - outside.clip(0, 4)).ravel()
-        return self._cut(_Walk(lab, self.smooth, 0.0), lab, enclosed, np.zeros(hull.shape, bool))
+        return self._cut(RandomWalk(lab, self.smooth, 0.0), lab, enclosed, np.zeros(hull.shape, bool))
 
     def _lab(self, pixels) -> Float[np.ndarray, "rows columns 3"]:
-        return ndimage.gaussian_filter(rgb2lab(_shrunk(pixels, self.side) / 255), (0.7, 0.7, 0))
+        return ndimage.gaussian_filter(rgb2lab(shrunk(pixels, self.side) / 255), (0.7, 0.7, 0))
 
     def _best(self, pixels: UInt8[np.ndarray, "height width 3"]) -> "_Reading":
         """Read a picture in both ways, and return the better reading."""
@@ -205,15 +204,15 @@ class CutOut:
         return max(readings, key=lambda reading: reading.score)
 
     def _read(self, lab, edge, texture: float, prior) -> Float[np.ndarray, "rows columns"]:
-        """Share of the object in each pixel."""
-        walk, prior = _Walk(lab, self.smooth, texture), prior.ravel()
+        """Return the share of the object in each pixel."""
+        walk, prior = RandomWalk(lab, self.smooth, texture), prior.ravel()
         # to begin with, the object is what no path from the border reaches without crossing edges
         crossed = np.log1p(walk.crossed(edge)) * prior
         between = threshold_otsu(crossed[~edge.ravel()])
         enclosed = (6 * (crossed - between)).clip(-4, 4) + 2 * np.log(prior)
         return self._cut(walk, lab, enclosed, edge)
 
-    def _cut(self, walk: "_Walk", lab, enclosed, edge) -> Float[np.ndarray, "rows columns"]:
+    def _cut(self, walk: "RandomWalk", lab, enclosed, edge) -> Float[np.ndarray, "rows columns"]:
         """Learn colours and cut along edges by turns; `enclosed` are each pixel's own log-odds of the object."""
         learnt = lab.reshape(-1, 3)
         found = walk.cut(1 / (1 + np.exp(-enclosed)))
@@ -221,7 +220,7 @@ class CutOut:
             inner = found > 0.5
             if inner.sum() < 20 or (~inner).sum() < 20:
                 break
-            object_, behind = _Mixture.of(learnt[inner], self.colours), _Mixture.of(learnt[~inner], self.colours)
+            object_, behind = Mixture.of(learnt[inner], self.colours), Mixture.of(learnt[~inner], self.colours)
             difference = (object_.log_density(learnt) - behind.log_density(learnt)).clip(-4, 4)
             share = 1 / (1 + np.exp(-difference - enclosed))
             share[edge.ravel()] = np.minimum(share[edge.ravel()], 0.2)  # an object may touch the border, hardly fill it
@@ -231,7 +230,7 @@ class CutOut:
 
 @dataclass(frozen=True)
 class _Reading:
-    """What a picture of few pixels was read as.
+    """Hold where a shrunken picture was found to show an object, and how clearly.
 
     Args:
         share: of the object in each pixel.
@@ -265,7 +264,7 @@ class _Reading:
         return self.outline**2 * self.place * min(1.0, self.area / SMALL)
 
     def doubts(self, limits: CutOut) -> list[str]:
-        """What speaks against it."""
+        """List in words why this reading may be wrong."""
         found = []
         if self.score < limits.sure and self.outline**2 <= self.place:
             found.append(f"only {self.outline:.0%} of its outline is an edge of colours")
@@ -279,100 +278,9 @@ class _Reading:
 
 
 def _nearby(lab, where) -> Float[np.ndarray, "rows columns 3"]:
-    """Mean colours of a part around each pixel."""
+    """Return the mean colours of a part around each pixel."""
     near = ndimage.gaussian_filter(where.astype(float), 2) + 1e-6
     return np.stack([ndimage.gaussian_filter(lab[..., c] * where, 2) / near for c in range(3)], -1)
-
-
-class _Walk:
-    """A random walk over a picture's pixels, which hardly crosses edges."""
-
-    def __init__(self, lab: Float[np.ndarray, "height width 3"], smooth: float, texture: float):
-        height, width, _ = lab.shape
-        number = np.arange(height * width).reshape(height, width)
-        steps = (
-            sum(np.linalg.norm(np.diff(lab, axis=axis, append=lab.take([-1], axis)), axis=-1) for axis in (0, 1)) / 2
-        )
-        usual = ndimage.uniform_filter(steps, 2 * (max(height, width) // 16) + 1, mode="nearest")
-        pairs, weights, around = [], [], []
-        for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-            first = (slice(0, height - down), slice(max(0, -right), width - max(0, right)))
-            second = (slice(down, height), slice(max(0, right), width - max(0, -right)))
-            pairs.append(np.stack([number[first].ravel(), number[second].ravel()]))
-            weights.append(((lab[first] - lab[second]) ** 2).sum(-1).ravel() / (down + abs(right)))
-            around.append(usual[first].ravel())
-        (start, end), squared = np.concatenate(pairs, 1), np.concatenate(weights)
-        near = smooth * np.exp(-squared / (2 * squared.mean() + 1e-9)) + 1e-4
-        graph = sparse.coo_array((near, (start, end)), shape=(number.size, number.size))
-        graph = (graph + graph.T).tocsr()
-        step = np.sqrt(squared)
-        # slow changes of colour are no edges, nor is a texture
-        edges = np.maximum(step - 2 * np.median(step) - 0.5 - texture * np.concatenate(around), 0) + 1e-3
-        self._edges = sparse.coo_array((edges, (start, end)), shape=graph.shape).tocsr()
-        self._matrix = (sparse.diags_array(graph.sum(1) + 1) - graph).tocsc()
-
-    def crossed(self, start: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "pixels"]:
-        """Differences of colour that a path from `start` has to cross at least (geodesic saliency, ECCV 2012)."""
-        return dijkstra(self._edges, directed=False, indices=np.flatnonzero(start), min_only=True)
-
-    def cut(self, share: Float[np.ndarray, "pixels"]) -> Float[np.ndarray, "pixels"]:
-        """The share of the object in each pixel, by what colours alone say of it and its neighbours."""
-        return spsolve(self._matrix, share)
-
-
-@dataclass(frozen=True)
-class _Mixture:
-    """Gaussians of colours."""
-
-    means: Float[np.ndarray, "k 3"]
-    inverse: Float[np.ndarray, "k 3 3"]
-    log_weights: Float[np.ndarray, "k"]
-
-    @staticmethod
-    def of(colours: Float[np.ndarray, "n 3"], k: int) -> "_Mixture":
-        """Split colours k - 1 times across the widest part (Orchard and Bouman 1991), and fit a Gaussian to each."""
-        parts = [colours]
-        while len(parts) < k:
-            widest = max(parts, key=lambda part: len(part) * np.linalg.eigvalsh(_spread(part))[-1])
-            axis = np.linalg.eigh(_spread(widest))[1][:, -1]
-            above = (widest - widest.mean(0)) @ axis > 0
-            if above.all() or not above.any():
-                break
-            parts = [part for part in parts if part is not widest] + [widest[above], widest[~above]]
-        inverse = np.stack([np.linalg.inv(_spread(part)) for part in parts])
-        weights = [
-            np.log(len(p) / len(colours)) + np.linalg.slogdet(i)[1] / 2 for p, i in zip(parts, inverse, strict=True)
-        ]
-        return _Mixture(np.stack([part.mean(0) for part in parts]), inverse, np.array(weights))
-
-    def log_density(self, colours: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        """Up to a constant that all mixtures share."""
-        offsets = colours[:, None] - self.means
-        distance = np.einsum("nki,kij,nkj->nk", offsets, self.inverse, offsets)
-        return np.logaddexp.reduce(self.log_weights - distance / 2, axis=1)
-
-
-def _spread(colours: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 3"]:
-    return (np.cov(colours.T) if len(colours) > 1 else np.zeros((3, 3))) + 4.0 * np.eye(3)
-
-
-def _refined(
-    pixels: UInt8[np.ndarray, "height width 3"], share: Float[np.ndarray, "rows columns"], side: int
-) -> Bool[np.ndarray, "height width"]:
-    """Follow a picture's own edges with a mask of few pixels."""
-    guide = _shrunk(pixels, side).astype(np.float32).mean(-1) / 255
-    size = (guide.shape[1], guide.shape[0])
-    large = np.asarray(Image.fromarray(share.astype(np.float32)).resize(size, Image.Resampling.BILINEAR))
-    window = 2 * max(2, round(1.5 * side / max(share.shape))) + 1
-
-    def mean(values):
-        return ndimage.uniform_filter(values, window, mode="nearest")
-
-    centre, level = mean(guide), mean(large)
-    slope = (mean(guide * large) - centre * level) / (mean(guide * guide) - centre**2 + 1e-3)
-    fine = mean(slope) * guide + mean(level - slope * centre)
-    back = Image.fromarray(fine.astype(np.float32)).resize(pixels.shape[1::-1], Image.Resampling.BILINEAR)
-    return np.asarray(back) > 0.5
 
 
 def _by_network(
@@ -423,14 +331,6 @@ def _doubts(path: str | Path, where: Bool[np.ndarray, "height width"], boxed: bo
     if area > 0.7:
         doubts.append(f"it covers {area:.0%} of the picture")
     return tuple(doubts)
-
-
-def _shrunk(pixels: UInt8[np.ndarray, "height width 3"], side: int) -> UInt8[np.ndarray, "rows columns 3"]:
-    image = Image.fromarray(pixels)
-    scale = side / max(image.size)
-    if scale >= 1:
-        return pixels
-    return np.asarray(image.resize([max(8, round(s * scale)) for s in image.size], Image.Resampling.BOX))
 
 
 def write_mask(mask: Mask, picture: Path, file: Path, shown: Path) -> None:

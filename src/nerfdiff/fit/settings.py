@@ -46,7 +46,8 @@ class FitSettings:
             left of the schedule is one step; None: all steps are taken.
         rise: dB by which they have to agree better.
         empty_below: opacity below which a pixel of a rendering for the teacher is empty. It keeps its colour where all
-            within `empty_reach` pixels of it are, but for every `whole_every`-th rendering. 0 renders all every time.
+            within `empty_reach` pixels of it are, but for every `whole_every`-th rendering. 0 renders all every time,
+            as do `views_last` and `coarse=refresh`.
         views_last: number of virtual views that are left at the last step, see `VirtualViews.choose`; None keeps all.
 
     Raises:

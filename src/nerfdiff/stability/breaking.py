@@ -106,7 +106,7 @@ class Point:
 
     @property
     def silent(self) -> tuple[Failure, ...]:
-        """Those failures that nobody is told of."""
+        """Return the failures whose status and verdict both say ok."""
         return tuple(failure for failure in self.failures if not failure.told)
 
 

@@ -13,7 +13,7 @@ from nerfdiff.data.picture import area_resample, window_around
 from nerfdiff.stress.photo import object_mask
 
 STRENGTHS = tuple(10.0**power for power in range(-4, 3))
-"""Of the ridge, as shares of the images; the held-out half chooses."""
+"""Strengths of the ridge that are tried, per image. The one with the least error on the held-out half is taken."""
 QUANTILE = 0.9
 FEWEST = 100
 """Images that a fit needs."""
@@ -68,7 +68,7 @@ class Elevation:
 
     @property
     def useful(self) -> bool:
-        """Whether it says at least twice as much as the training images' median does."""
+        """Return true if the estimate's mean error is at most half that of always saying the median."""
         return self.error <= self.spread / 2
 
     def __call__(self, found: Float[Tensor, "images dim"]) -> Float[Tensor, "images"]:

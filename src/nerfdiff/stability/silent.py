@@ -12,7 +12,8 @@ from nerfdiff.stability.study import Study, seed_of
 from nerfdiff.stability.text import number_text, severity_text
 
 COLUMNS = ("axis", "severity", "strategy", "seed", "scene", "rules", "loss", "harm", "clean_harm")
-"""Of `silent.csv`: the last three are dB under its own clean result, under `none` with this stress, and without any."""
+"""Columns of `silent.csv`. The last three are in dB: how far a scene lies under its own clean result, under `none` with
+the same stress, and under `none` without any."""
 
 
 @dataclass(frozen=True)
@@ -27,12 +28,12 @@ class Silent:
 
     @property
     def words(self) -> str:
-        """The axis and the severity in its unit."""
+        """Return the name of the axis, and the severity in its unit."""
         return f"{self.stress.name} {severity_text(self.stress, self.severity)}"
 
     @property
     def worst(self) -> float:
-        """By how many dB it lost most."""
+        """Return its greater loss in dB: against its own clean result, or against `none`."""
         return max(value for value in (self.failure.loss, self.failure.harm, -100.0) if value is not None)
 
     def harmed_by_stress(self, rules: Rules) -> bool:
@@ -41,7 +42,7 @@ class Silent:
         return harm is not None and harm - max(0.0, clean or 0.0) >= rules.harm
 
     def line(self) -> dict[str, object]:
-        """A line of `silent.csv`."""
+        """Return its line of `silent.csv`."""
         failure = self.failure
         values = {name: getattr(failure, name) for name in COLUMNS[3:]}
         return {"axis": self.stress.axis, "severity": self.severity, "strategy": self.strategy, **values}
@@ -62,7 +63,7 @@ def silent_failures(study: Study) -> list[Silent]:
 
 
 def worst_of_each(found: Sequence[Silent]) -> list[Silent]:
-    """Of every axis and severity, the failure that lost most."""
+    """Return one failure for each axis and severity: the one that lost most."""
     worst: dict[tuple[str, float], Silent] = {}
     for each in found:
         key = each.stress.axis, each.severity

@@ -82,7 +82,7 @@ class Study:
 
     @property
     def silent_lost(self) -> int:
-        """Silent failures of rule b; the others are of rule c alone."""
+        """Count the silent failures of rule b; the others are of rule c alone."""
         points = (point for verdict in self.verdicts for point in verdict.points)
         return sum("b" in failure.rules for point in points for failure in point.silent)
 

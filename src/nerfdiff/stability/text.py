@@ -108,7 +108,7 @@ def _lines(study: Study) -> list[list[str]]:
 
 
 def number_text(value: float | None) -> str:
-    """Two digits after the point, or a dash where there is no finite number."""
+    """Write a number with two digits after the point, or a dash where there is no finite one."""
     return "–" if value is None or not math.isfinite(value) else f"{value:.2f}"
 
 

@@ -37,7 +37,7 @@ def silent_sheet(path: Path, found: Sequence[Silent]) -> Path | None:
 
 
 def _strip(silent: Silent) -> torch.Tensor | None:
-    """Input, truth and view [3, h, 3w]; None where the run left no pictures."""
+    """Return input, truth and view beside each other [3, h, 3w]; None where the run left no pictures."""
     run, scene = silent.run, silent.failure.scene
     folder = None if run is None else run.file("predictions", silent.strategy)
     job = None if folder is None else folder.parents[2] / ".hydra" / "config.yaml"

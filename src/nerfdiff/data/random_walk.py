@@ -48,7 +48,7 @@ class RandomWalk:
 
 @dataclass(frozen=True)
 class Mixture:
-    """Gaussians of colours."""
+    """Hold a mixture of Gaussians of colours."""
 
     means: Float[np.ndarray, "k 3"]
     inverse: Float[np.ndarray, "k 3 3"]
@@ -72,7 +72,7 @@ class Mixture:
         return Mixture(np.stack([part.mean(0) for part in parts]), inverse, np.array(weights))
 
     def log_density(self, colours: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        """Up to a constant that all mixtures share."""
+        """Return the log of the density, up to a constant that all mixtures share."""
         offsets = colours[:, None] - self.means
         distance = np.einsum("nki,kij,nkj->nk", offsets, self.inverse, offsets)
         return np.logaddexp.reduce(self.log_weights - distance / 2, axis=1)
@@ -102,6 +102,7 @@ def refined(
 
 
 def shrunk(pixels: UInt8[np.ndarray, "height width 3"], side: int) -> UInt8[np.ndarray, "rows columns 3"]:
+    """Shrink a picture until its longer side has at most `side` pixels."""
     image = Image.fromarray(pixels)
     scale = side / max(image.size)
     if scale >= 1:

@@ -111,17 +111,10 @@ def test_other_notebooks_run_from_first_to_last(name, tmp_path, monkeypatch, cap
         assert set(space["verdicts"]) == {"car", "elevation", "half", "chair"}
 
 
-NOT_YET = {"one_picture", "train_in_five_minutes"}
-"""Still stored without outputs: `make notebooks` makes them, and then they leave this set."""
-
-
 @pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem)
 def test_notebooks_are_stored_with_outputs_of_their_own_source(path):
     cells = [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
     assert path.stat().st_size < 400_000
-    if path.stem in NOT_YET:
-        assert not any(cell.outputs for cell in cells), f"{path.stem} has outputs: take it out of NOT_YET"
-        return
     assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1)), "make notebooks"
     outputs = [output for cell in cells for output in cell.outputs]
     assert not [output for output in outputs if output.output_type == "error"]

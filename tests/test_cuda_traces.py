@@ -24,7 +24,8 @@ from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.fit.settings import FitSettings
 from nerfdiff.model import NerfDiff
 from nerfdiff.training.module import NerfDiffModule
-from nerfdiff.training.resident import FrozenField, ResidentScenes, Step
+from nerfdiff.training.resident import Step
+from nerfdiff.training.resident_scenes import FrozenField, ResidentScenes
 
 SIDE = 8
 OPTIMIZER = {"lr": 1e-3, "weight_decay": 0.01, "betas": [0.9, 0.99]}

@@ -14,7 +14,8 @@ from nerfdiff.data.readers.srn import SRNReader
 from nerfdiff.model import NerfDiff
 from nerfdiff.training import resident
 from nerfdiff.training.module import NerfDiffModule
-from nerfdiff.training.resident import FrozenField, ResidentScenes, Step, draw_table, train_resident
+from nerfdiff.training.resident import Step, train_resident
+from nerfdiff.training.resident_scenes import FrozenField, ResidentScenes, draw_table
 from nerfdiff.utils.errors import ConfigError, DataError
 from training_fixtures import run_training, write_dataset
 

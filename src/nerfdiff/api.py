@@ -218,10 +218,10 @@ class Scene:
             height: in pixels; None: the input picture's.
         """
         where = None if elevation is None else torch.tensor([float(elevation)])
-        export = self._export()
+        export = self._default
         camera = export.stands.around(export.source, torch.tensor([float(azimuth)]), where)
         camera = camera.to(self.saved.field.K.device)
-        return to_image(render_rgba(self.saved, camera, height or camera.height)[0])
+        return to_image(export.cleared(render_rgba(self.saved, camera, height or camera.height))[0])
 
     def orbit(self, path: str | Path, frames: int = 48, fps: int = 24, height: int = 256) -> Path:
         """Write a video of a full turn, as `.mp4` or `.gif`.

@@ -12,9 +12,10 @@ import torch
 import trimesh
 from PIL import Image
 
-from bars_scene import BARS, STANDS, THICK, bars_scene
+from bars_scene import BALL, BARS, SLAB, STANDS, THICK, BarsOnSlab, bars_scene
 from nerfdiff.cameras import Cameras
 from nerfdiff.cli import load_config
+from nerfdiff.exports.backdrop import Backdrop
 from nerfdiff.exports.export import FieldExport, export_fields, field_name
 from nerfdiff.exports.views import CameraPath, over, render_rgba
 from nerfdiff.fit.saved_field import FIELD, SavedField, load_field, save_field
@@ -140,6 +141,51 @@ def test_pictures_keep_what_is_transparent(saved, files):
     assert pictures[0][0, 0, 3] == 0 and pictures[0][..., 3].max() == 255
     edge = (truth[..., 3] > 0.2) & (truth[..., 3] < 0.8)  # the scene's own colour, without the white behind it
     assert pictures[0][..., :3][edge].mean(-1).max() < 0.75 * 255
+
+
+def below_the_ball(export):
+    """Heights of a mesh's corners under the ball, as shares of the slab's, and the least channel of each."""
+    axes = STANDS.axes(export.source)
+    points = (export.surface.points - STANDS.point) @ axes.T
+    under = (points[:, [0, 2]].abs() < SLAB[0]).all(1) & (points[:, 1] < -BALL)
+    return (-BALL - points[under, 1]) / (2 * SLAB[1]), export.surface.colours[under].amin(1)
+
+
+def test_what_only_repeats_the_background_is_left_out_of_meshes_and_pictures(tmp_path):
+    scene = bars_scene(BarsOnSlab)
+    kept, clear = (export_of(scene, *more) for more in (["mesh.backdrop.views=0"], ["mesh.backdrop.own_share=0.5"]))
+    depth, least = below_the_ball(kept)
+    assert depth.max() > 0.9 and least.max() > 0.95
+    depth, least = below_the_ball(clear)
+    assert not len(depth) or (depth.max() < 0.5 and least.max() < 0.8)
+    # nothing else went: the bars and the ball are those of the scene without a slab
+    whole = export_of(bars_scene())
+    assert clear.surface.points.amax(0) == pytest.approx(whole.surface.points.amax(0), abs=0.01)
+    pictures = [export.clear_frames[0] for export in (kept, clear, whole)]
+    assert (pictures[0][3] - pictures[2][3]).abs().max() > 0.9
+    assert (pictures[1][3] - pictures[2][3]).abs().mean() < 0.01
+    assert torch.allclose(over(pictures[1][None], 1.0), over(pictures[0][None], 1.0), atol=0.01)
+
+
+def test_an_object_as_light_as_its_background_is_kept_and_named(caplog):
+    kept, light = (export_of(bars_scene(BarsOnSlab), *more) for more in (["mesh.backdrop.views=0"], []))
+    assert torch.equal(kept.surface.points, light.surface.points)
+    assert "as light as the background" in caplog.text
+
+
+def test_a_large_patch_of_the_background_takes_the_colours_beside_it_and_a_small_one_stays():
+    settings = export_of(bars_scene(), "mesh.backdrop.patch=0.2", "mesh.backdrop.rim=0.15").mesh.backdrop
+    backdrop = Backdrop(settings, 1.0, bars_scene().field.cameras, torch.zeros(1, 48, 64, dtype=torch.bool))
+    n = 20  # a strip of triangles: a red end, two rim corners, a white end with one white corner apart
+    points = torch.stack([torch.arange(n) / n, torch.arange(n) % 2 / n, torch.zeros(n)], 1)
+    faces = np.stack([np.arange(n - 2), np.arange(1, n - 1), np.arange(2, n)], 1)
+    colours = torch.tensor([[0.8, 0.1, 0.1]]).repeat(n, 1)
+    colours[3] = 1.0
+    colours[10:12] = torch.tensor([0.9, 0.7, 0.7])
+    colours[12:] = 1.0
+    painted = backdrop.painted_over(points, colours, faces)
+    assert torch.equal(painted[:10], colours[:10])
+    assert torch.allclose(painted[10:], torch.tensor([0.8, 0.1, 0.1]), atol=1e-6)
 
 
 def test_pictures_may_be_larger_than_the_models(saved):

@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from nerfdiff.evaluation.run import SAMPLES, choose_device
+from nerfdiff.exports.backdrop import Backdrop
 from nerfdiff.exports.models import write_mesh, write_points
 from nerfdiff.exports.surface import Surface, SurfaceSettings
 from nerfdiff.exports.viewer import write_viewer
@@ -73,14 +74,31 @@ class FieldExport:
         return self.saved.field.cameras.to("cpu")
 
     @cached_property
+    def backdrop(self) -> Backdrop | None:
+        return self.mesh.backdrop.look(self.saved, self.stands)
+
+    @cached_property
     def surface(self) -> Surface:
-        return self.mesh.surface(self.saved, self.stands)
+        return self.mesh.surface(self.saved, self.stands, self.backdrop)
 
     @cached_property
     def frames(self) -> Float[Tensor, "frames 4 height _width"]:
         """Pictures along the path, with transparency."""
         cameras = self.path.cameras(self.source, self.stands).to(self.saved.field.K.device)
         return render_rgba(self.saved, cameras, self.height)
+
+    @cached_property
+    def clear_frames(self) -> Float[Tensor, "frames 4 height _width"]:
+        """The same without what only repeats the field's background."""
+        return self.cleared(self.frames)
+
+    def cleared(self, rgba: Float[Tensor, "views 4 height width"]) -> Float[Tensor, "views 4 height width"]:
+        """Pictures with transparency, without what only repeats the field's background."""
+        return rgba if self.backdrop is None else self.backdrop.cleared(rgba)
+
+    def _filmed(self) -> Float[Tensor, "frames 3 height _width"]:
+        own = self.background == self.saved.renderer.background
+        return over(self.frames if own else self.clear_frames, self.background)
 
     def write(self, folder: Path, name: str, formats: Collection[str]) -> list[Path]:
         """Write `<folder>/<name>.<format>` for each format; of png a folder `<name>_views`.
@@ -104,20 +122,21 @@ class FieldExport:
         return write_viewer(path, self.saved, self.stands, path.stem, **self.viewer)
 
     def _mp4(self, path: Path) -> Path:
-        return orbit_video(path, over(self.frames, self.background), self.fps)
+        return orbit_video(path, self._filmed(), self.fps)
 
     def _gif(self, path: Path) -> Path:
-        frames = quantise(over(self.frames, self.background)).permute(0, 2, 3, 1).numpy()
+        frames = quantise(self._filmed()).permute(0, 2, 3, 1).numpy()
         with atomic(path) as temporary:
             imageio.mimwrite(temporary, list(frames), duration=1000 / self.fps, loop=0)
         return path
 
     def _png(self, path: Path) -> Path:
         folder = path.with_name(f"{path.stem}_views")
-        count = min(self.views, len(self.frames))
+        frames = self.clear_frames
+        count = min(self.views, len(frames))
         for number in range(count):
             with atomic(folder / f"{number:02d}.png") as temporary:
-                to_image(self.frames[number * len(self.frames) // count]).save(temporary)
+                to_image(frames[number * len(frames) // count]).save(temporary)
         return folder
 
 

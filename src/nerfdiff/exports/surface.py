@@ -10,6 +10,7 @@ from skimage.measure import label, marching_cubes
 from torch import Tensor
 
 from nerfdiff.cameras import Cameras, Rays
+from nerfdiff.exports.backdrop import Backdrop, BackdropSettings
 from nerfdiff.exports.views import render_rays
 from nerfdiff.fit.saved_field import SavedField
 from nerfdiff.trajectories import Upright
@@ -43,6 +44,7 @@ class SurfaceSettings:
         speck: parts smaller than this share of the largest one are left out.
         colour_views: cameras around the scene that colours are taken from, beside the input camera.
         input_weight: of the input camera's colours against the others', where it sees a point.
+        backdrop: tells what only repeats the background; it is left out.
 
     Raises:
         ConfigError: values that are impossible.
@@ -53,6 +55,7 @@ class SurfaceSettings:
     speck: float
     colour_views: int
     input_weight: float
+    backdrop: BackdropSettings
 
     def __post_init__(self):
         for key, possible, expected in (
@@ -65,18 +68,26 @@ class SurfaceSettings:
             if not possible:
                 raise ConfigError(f"mesh.{key}={getattr(self, key)}: expected {expected}")
 
-    def surface(self, saved: SavedField, stands: Upright) -> Surface:
+    def surface(self, saved: SavedField, stands: Upright, backdrop: Backdrop | None) -> Surface:
         """Return the surface where the field's density passes `density`, coloured as cameras around it see it.
+
+        Args:
+            backdrop: tells what is left out.
 
         Raises:
             DataError: the field is empty there.
         """
-        points, faces = self._triangles(saved, stands)
+        points, faces = self._triangles(saved, stands, backdrop)
         normals = _normals(points, faces)
-        return Surface(points, normals, self._colours(saved, stands, points, normals), faces)
+        colours = self._colours(saved, stands, points, normals)
+        if backdrop is not None:
+            colours = backdrop.painted_over(points, colours, faces)
+        return Surface(points, normals, colours, faces)
 
     @torch.no_grad()
-    def _triangles(self, saved: SavedField, stands: Upright) -> tuple[Float[Tensor, "n 3"], Int[np.ndarray, "m 3"]]:
+    def _triangles(
+        self, saved: SavedField, stands: Upright, backdrop: Backdrop | None
+    ) -> tuple[Float[Tensor, "n 3"], Int[np.ndarray, "m 3"]]:
         field, n = saved.field.field(), self.resolution
         depth = float(saved.field.far[0] - saved.field.near[0])
         axis = torch.linspace(-depth / 2, depth / 2, n)
@@ -86,9 +97,13 @@ class SurfaceSettings:
             offsets = torch.stack([x.expand_as(y), y, z], -1)
             within = offsets.norm(dim=-1) < depth / 2
             if within.any():
-                points = (offsets[within] + stands.point.cpu()).to(saved.field.K.device)
-                _, density = field(points[None], torch.zeros_like(points)[None])
-                volume[i][within.numpy()] = density[0].cpu().numpy() * depth
+                points = offsets[within] + stands.point.cpu()
+                at = points[None].to(saved.field.K.device)
+                rgb, density = (part[0].cpu() for part in field(at, torch.zeros_like(at)))
+                if backdrop is not None:
+                    alike = backdrop.repeats(rgb) & (density * depth >= self.density)
+                    density[alike] *= ~backdrop.alone(points[alike])
+                volume[i][within.numpy()] = density.numpy() * depth
         if not (volume >= self.density).any():
             raise DataError(
                 f"the field is empty: its density is at most {volume.max():.3g} / (far - near), and mesh.density is "

@@ -1,5 +1,6 @@
 """The object of a photograph, found before whatever background: by a network, or by what the border looks like."""
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -155,6 +156,7 @@ class CutOut:
         if within is not None:
             found = self._fine(pixels, self._closer(pixels, within, 1.0)) & within
         else:
+            self._refuse_narrow(path, pixels.shape[:2])
             first = self._best(pixels)
             doubts = first.doubts(self)
             if first.score < self.clear:
@@ -167,6 +169,20 @@ class CutOut:
                 found = np.zeros_like(found)
                 found[window] = closer
         return found, doubts
+
+    def _band(self, longer: int) -> int:
+        """Return the border's pixels of a shrunken picture."""
+        return max(2, round(self.border * longer))
+
+    def _refuse_narrow(self, path: str | Path, shape: tuple[int, int]) -> None:
+        """Raise DataError where the border leaves no room for an object."""
+        longer = max(shape)
+        least = math.ceil((2 * self._band(min(longer, self.side)) + 4) * max(1.0, longer / self.side))
+        if min(shape) < least:
+            raise DataError(
+                f"{path}: {shape[1]}x{shape[0]} pixels (width x height) are too few to find an object in; its shorter "
+                f"side needs at least {least}. Give a larger picture, or one with more around the object"
+            )
 
     def _fine(self, pixels, share) -> Bool[np.ndarray, "height width"]:
         return _main_part(refined(pixels, share, self.fine))
@@ -191,7 +207,7 @@ class CutOut:
         """Read a picture in both ways, and return the better reading."""
         lab = self._lab(pixels)
         height, width, _ = lab.shape
-        band = max(2, round(self.border * max(height, width)))
+        band = self._band(max(height, width))
         edge = np.ones((height, width), bool)
         edge[band:-band, band:-band] = False
         down, right = np.mgrid[:height, :width]

@@ -43,6 +43,10 @@ class Mask:
     how: str
     doubts: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        height, width = self.where.shape
+        return f"Mask({height}x{width} pixels, {self.where.mean():.0%} of them the object, found {self.how})"
+
 
 @dataclass(frozen=True)
 class CutOut:
@@ -305,7 +309,7 @@ def _by_network(
     try:
         import rembg
     except ImportError as error:
-        raise ConfigError("a network's weights are there, but rembg is not: pip install 'nerfdiff[cutout]'") from error
+        raise ConfigError("a network's weights are there, but rembg is not: pip install 'rembg[cpu]'") from error
     session = rembg.new_session(name, **({} if weights is None else {"model_path": str(weights)}))
     found = rembg.remove(Image.fromarray(pixels), session=session, only_mask=True)
     return np.asarray(found.convert("L")) > 127

@@ -106,6 +106,8 @@ def test_a_box_is_taken_before_white_too_and_not_beside_a_mask(tmp_path, caplog)
         (["images=[a.png,b.png]", "box=[1,2,30,40]"], "box=.* is of one picture, and there are 2"),
         (["images=[a.png]", "format=[stl]"], "'stl'.*glb"),
         (["images=[a.png]", "box=[1,2]"], r"box=\[1, 2\]: expected"),
+        (["images=[a.png]", "box=[a,b,c,d]"], r"box=\['a', 'b', 'c', 'd'\]: expected"),
+        (["images=[a.png]", "box=[0,0,9,8.5]"], r"box=\[0, 0, 9, 8\.5\]: .* within the picture's 9x8 "),
         (["images=[a.png]", "box=[1,2,30,40]", "mask=m.png"], "both say where the object is"),
         *((["images=[a.png]", f"strategy={name}"], f"strategy={name} leaves no scene") for name in NO_SCENE),
         (["images=[empty.png]"], "empty.png: .*empty"),
@@ -127,9 +129,12 @@ def test_what_cannot_be_is_said_first(tmp_path, words, said, monkeypatch):
 def test_what_can_be_passes(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Image.new("RGB", (9, 8)).save("a.png")
-    Image.new("L", (8, 9)).save("turned.png")
+    turned = Image.new("L", (8, 9))
+    turned.getexif()[0x0112] = 6  # by a quarter
+    turned.save("turned.png", exif=turned.getexif())
     check(load_config("picture", ["images=[a.png,a.png]", "strategy=none", "format=[glb]"]))
     check(load_config("picture", ["images=[a.png]", "mask=turned.png"]))
+    check(load_config("picture", ["images=[a.png]", "box=[0,0,9,8]"]))
 
 
 def test_what_cannot_be_is_said_before_slow_imports(tmp_path):

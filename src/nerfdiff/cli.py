@@ -238,7 +238,10 @@ def prepare_arguments(config_name: str, inputs: Sequence[str], arguments: list[s
     check_inputs(config, inputs, swept=swept | set(config.hydra.sweeper.get("params") or ()), only=fixed)
     # jobs, in whatever process, are to name their folders by what is swept
     untold = [key for key, override in fixed.items() if not override.is_hydra_override()]
-    return [*arguments, f"{EXCLUDED}=[{','.join(untold)}]"]
+    # beside other overrides: argparse takes them from one place only, be it before -m or behind it
+    places = [n for n, word in enumerate(arguments, 1) if not word.startswith("-") and "=" in word]
+    place = places[-1] if places else len(arguments)
+    return [*arguments[:place], f"{EXCLUDED}=[{','.join(untold)}]", *arguments[place:]]
 
 
 def _overrides(arguments: list[str]) -> list[Override]:
@@ -326,10 +329,10 @@ def _compose(config_name: str, overrides: list[str], with_hydra: bool = False) -
         with initialize_config_dir(str(CONF), version_base="1.3"):
             return compose(config_name, overrides, return_hydra_config=with_hydra)
     except MissingConfigException as error:
-        choices = f"; choices: {', '.join(error.options)}" if error.options else ""
+        listed = ", ".join(error.options or ())
         close = difflib.get_close_matches(str(error.missing_cfg_file).rpartition("/")[2], error.options or (), 1)
-        meant = f"; did you mean {close[0]}?" if close else ""
-        raise ConfigError(f"there is no {error.missing_cfg_file}{meant}{choices}") from error
+        others = f"; did you mean {close[0]}? Choices: {listed}" if close else f"; choices: {listed}" if listed else ""
+        raise ConfigError(f"there is no {error.missing_cfg_file}{others}") from error
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_one_line(error, error.__cause__ or "")) from error
     finally:

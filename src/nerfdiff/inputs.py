@@ -1,7 +1,7 @@
 """Files and folders that commands read, looked for without importing anything slow."""
 
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -107,10 +107,20 @@ def check_picture_settings(cfg: DictConfig) -> None:
     box = cfg.cutout.box
     if cfg.strategy.name in NO_SCENE:
         raise ConfigError(f"strategy={cfg.strategy.name} leaves no scene: choose one that does, as ngd_current")
-    if box is not None and len(box) != 4:
+    if box is not None and (len(box) != 4 or not all(isinstance(edge, int | float) for edge in box)):
         raise ConfigError(f"box={list(box)}: expected [left, top, right, bottom] in pixels")
     if box is not None and cfg.mask is not None:
         raise ConfigError(f"box={list(box)} and mask={cfg.mask} both say where the object is: give one")
+
+
+def check_box(box: Sequence[float], height: int, width: int) -> None:
+    """Raise ConfigError where [left, top, right, bottom] are not within a picture, or too near to each other."""
+    left, top, right, bottom = box
+    if not (0 <= left < right <= width and 0 <= top < bottom <= height) or min(right - left, bottom - top) < 8:
+        raise ConfigError(
+            f"box={list(box)}: expected [left, top, right, bottom] in pixels, at least 8 apart, within the "
+            f"picture's {width}x{height} (width x height, as it is shown)"
+        )
 
 
 def check_output(cfg: DictConfig) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from nerfdiff.cli import command_words, entry_point
-from nerfdiff.inputs import check_formats, check_picture_settings
+from nerfdiff.inputs import check_box, check_formats, check_picture_settings
 from nerfdiff.utils.errors import ConfigError, DataError
 
 
@@ -15,7 +15,7 @@ def check(cfg: DictConfig) -> None:
     Raises:
         UserError: naming the setting or the file.
     """
-    from nerfdiff.data.formats.images import stored_size  # with NumPy: not for --cfg
+    from nerfdiff.data.formats.images import upright_size  # with NumPy: not for --cfg
 
     check_formats(cfg.format)
     check_picture_settings(cfg)
@@ -26,8 +26,10 @@ def check(cfg: DictConfig) -> None:
             raise ConfigError(
                 f"{key}={cfg[key]} is of one picture, and there are {len(cfg.images)}: give one at a time"
             )
-    sizes = [stored_size(Path(image)) for image in cfg.images]
-    if cfg.mask is not None and sorted(size := stored_size(Path(cfg.mask))) != sorted(sizes[0]):  # either may be turned
+    sizes = [upright_size(Path(image)) for image in cfg.images]
+    if cfg.cutout.box is not None:
+        check_box(cfg.cutout.box, *sizes[0])
+    if cfg.mask is not None and (size := upright_size(Path(cfg.mask))) != sizes[0]:
         (h, w), (rows, columns) = size, sizes[0]
         raise DataError(
             f"{cfg.mask}: a mask of {h}x{w} for {cfg.images[0]} of {rows}x{columns} (height x width); expected one size"

@@ -16,6 +16,7 @@ from skimage.morphology import convex_hull_image
 
 from nerfdiff.data.formats.images import decode_with_alpha
 from nerfdiff.data.random_walk import Mixture, RandomWalk, refined, shrunk
+from nerfdiff.inputs import check_box
 from nerfdiff.utils.errors import ConfigError, DataError
 from nerfdiff.utils.files import atomic
 
@@ -133,12 +134,8 @@ class CutOut:
         """Return the part of a picture that is looked at, and where in it the box is."""
         if self.box is None:
             return (slice(None), slice(None)), None
-        (height, width), (left, top, right, bottom) = shape, (round(edge) for edge in self.box)
-        if not (0 <= left < right <= width and 0 <= top < bottom <= height) or min(right - left, bottom - top) < 8:
-            raise ConfigError(
-                f"box={list(self.box)}: expected [left, top, right, bottom] in pixels, at least 8 apart, within the "
-                f"picture's {width}x{height} (width x height, as it is shown)"
-            )
+        check_box(self.box, *shape)
+        left, top, right, bottom = (round(edge) for edge in self.box)
         where = np.zeros(shape, bool)
         where[top:bottom, left:right] = True
         window = _around(where)

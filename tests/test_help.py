@@ -33,6 +33,9 @@ def test_help_is_one_screen_of_what_is_there(command, monkeypatch, capsys):
     assert 2 <= len(examples) == len(parts["Examples:"].splitlines()) <= 5
     for path, words in examples:
         assert path == f"src/{command}.py"
+        assert not any("=assets/" in word for word in words)  # which an installed command does not have
+        if command in ("train", "distill", "evaluate"):
+            assert any(word.startswith(("data.root=", "image=")) for word in words)  # or it ends with "no such folder"
         check_overrides(command, quote_values(gather_lists(command, words)))  # which composes
 
     config = _composed(command)

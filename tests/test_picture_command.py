@@ -161,7 +161,7 @@ def test_a_stopped_command_says_what_is_complete(tmp_path, monkeypatch):
 
     monkeypatch.setattr("nerfdiff.pictures._make", stop_at_the_second)
     wagon = ASSETS / "pictures" / "wagon.png"
-    with pytest.raises(Stopped, match="1 of 2 pictures are complete; a scene that was not begins anew") as stopped:
+    with pytest.raises(Stopped, match="1 of 2 pictures are complete; a scene in the making begins anew") as stopped:
         made(tmp_path, f"images=['{wagon}','{wagon}']")
     assert stopped.value.signum == 2
 

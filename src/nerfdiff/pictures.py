@@ -60,7 +60,7 @@ def pictures(cfg: DictConfig) -> list[Path]:
             failed.append(image)
             log.error("%s", error)
         except Stopped as stopped:
-            done = f"{len(made)} of {len(cfg.images)} pictures are complete; a scene that was not begins anew."
+            done = f"{len(made)} of {len(cfg.images)} pictures are complete; a scene in the making begins anew."
             raise Stopped(stopped.signum, done) from None
     if failed:
         raise DataError(f"{len(failed)} of {len(cfg.images)} pictures failed, see above")

@@ -156,5 +156,5 @@ def test_a_networks_weights_are_taken_where_they_are_and_never_fetched(tmp_path,
     cut_out(weights=own).find(tmp_path / "car.jpg")
     assert asked[-1] == ("u2net_custom", {"model_path": own})
     monkeypatch.setitem(sys.modules, "rembg", None)
-    with pytest.raises(ConfigError, match=r"pip install 'nerfdiff\[cutout\]'"):
+    with pytest.raises(ConfigError, match=r"pip install 'rembg\[cpu\]'"):
         cut_out().find(tmp_path / "car.jpg")

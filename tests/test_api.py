@@ -1,5 +1,7 @@
 """NerfDiff from Python, with the shipped model."""
 
+import inspect
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -10,12 +12,13 @@ from PIL import Image
 import nerfdiff
 from nerfdiff.api import _of_picture
 from nerfdiff.cli import load_config
+from nerfdiff.data.cutout import Mask
 from nerfdiff.distill.priors import all_cameras
 from nerfdiff.evaluation.run import picture_scene
 from nerfdiff.exports.views import render_rgba
 from nerfdiff.inputs import ASSETS
 from nerfdiff.trajectories import Upright
-from nerfdiff.utils.errors import ConfigError, DataError
+from nerfdiff.utils.errors import ConfigError, DataError, UserError
 
 WAGON = ASSETS / "pictures" / "wagon.png"
 WAGON_ELEVATION = 23  # of its camera, in degrees
@@ -29,7 +32,56 @@ def model() -> nerfdiff.Model:
 
 @pytest.fixture(scope="module")
 def scene(model) -> nerfdiff.Scene:
-    return model.distil(WAGON, elevation=30, settings=[*SMALL, "picture_views.views=2"])
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", ".*LeafSpec")  # a user can do nothing about it
+        return model.distil(WAGON, elevation=30, settings=[*SMALL, "picture_views.views=2"])
+
+
+def test_models_scenes_and_masks_are_shown_in_one_line(model, scene):
+    about = "64x64 pixels, trained on procedural cars seen from elevations of 0 to 90 degrees"
+    assert repr(model) == f"Model({ASSETS / 'demo' / 'model.safetensors'}: {about}; on cpu)"
+    assert repr(scene) == f"Scene(64x64 pixels, on cpu; {scene.verdict})"
+    assert repr(replace(scene, verdict=None)) == "Scene(64x64 pixels, on cpu)"
+    mask = Mask(np.eye(4, dtype=bool), "by its colours", ())
+    assert repr(mask) == "Mask(4x4 pixels, 25% of them the object, found by its colours)"
+    assert len(repr(replace(model.loaded, trained_on=()))) < 300
+
+
+def test_what_is_known_of_training_images_is_read_once(model, monkeypatch):
+    loaded, read = replace(model.loaded), []
+    monkeypatch.setattr("nerfdiff.stability.familiar.Familiar.load", lambda path: read.append(path))
+    assert loaded.familiar is None and loaded.familiar is None and len(read) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"settings": ["budget.steps"]}, r"settings=\['budget\.steps'\]: expected a list of key=value"),
+        ({"settings": "budget.steps=32"}, "settings='budget.steps=32': expected a list of key=value"),
+        ({"settings": [32]}, "expected a list of key=value"),
+        ({"settings": ["budget.stepz=32"]}, r"did you mean budget\.steps\?"),
+        ({"elevation": "high"}, "elevation='high': expected degrees"),
+        ({"elevation": float("nan")}, "elevation=nan: expected degrees"),
+        ({"elevation": [3]}, r"elevation=\[3\]: expected degrees"),
+        ({"box": "left"}, "box='left': expected .left, top, right, bottom"),
+        ({"box": [1, 2, 3]}, r"box=\[1, 2, 3\]: expected"),
+        ({"box": 7}, "box=7: expected"),
+        ({"settings": ["box=[1,2,3]"]}, r"box=\[1, 2, 3\]: expected"),
+        ({"picture": Image.new("RGB", (9, 9))}, "picture=Image: expected the path of a file; save the image"),
+        ({"picture": None}, "picture=NoneType: expected the path"),
+        ({"picture": ASSETS}, "assets: is a folder; name a picture"),
+        ({"picture": "nothere.png"}, "picture=nothere.png: no such file"),
+        ({"mask": np.zeros((9, 9))}, "mask=ndarray: expected the path"),
+        ({"mask": "nothere.png"}, "mask=nothere.png: no such file"),
+        ({"mask": WAGON, "box": [0, 0, 50, 50]}, "both say where the object is"),
+        ({"strategy": "mean_image"}, "strategy=mean_image leaves no scene"),
+        ({"strategy": "ngd_curent"}, r"no strategy/ngd_curent; did you mean ngd_current\?"),
+        ({"seed": "x"}, "seed takes int"),
+    ],
+)
+def test_arguments_that_cannot_be_are_named(model, arguments, said):
+    with pytest.raises(UserError, match=said):
+        inspect.unwrap(nerfdiff.Model.distil)(model, **({"picture": WAGON} | arguments))  # as without types checked
 
 
 def test_a_scene_shows_the_picture_and_its_other_sides(scene):
@@ -77,7 +129,6 @@ def test_pictures_are_framed_as_the_models_were(model, tmp_path, caplog):
 
 
 def test_the_elevation_is_estimated_where_the_model_can(model, tmp_path, caplog):
-    caplog.set_level("INFO")
     cfg = _of_picture(load_config("picture", []), WAGON, model.loaded)
     scene = picture_scene(cfg, model.loaded, (64, 64))
     assert cfg.picture_views.source_elevation == pytest.approx(WAGON_ELEVATION, abs=8)
@@ -96,13 +147,16 @@ def test_the_elevation_is_estimated_where_the_model_can(model, tmp_path, caplog)
 
 
 def test_what_cannot_be_is_named(model, scene, tmp_path):
+    cfg = load_config("picture", ["strategy=cdm", "strategy.steps=1", "picture_views.views=2"])
     with pytest.raises(ConfigError, match="strategy=cdm leaves no scene"):
-        model.distil(WAGON, strategy="cdm", settings=["strategy.steps=1", "picture_views.views=2"])
+        model.distil_batch(*model.prepare(cfg, WAGON))
     with pytest.raises(ConfigError, match=r"expected one of \.safetensors, \.glb"):
         scene.save(tmp_path / "car.fbx")
     with pytest.raises(ConfigError, match=r"\.mp4 or \.gif"):
         scene.orbit(tmp_path / "car.avi")
     with pytest.raises(DataError, match="not a field saved by this project"):
         nerfdiff.load_scene(WAGON)
+    with pytest.raises(DataError, match=r"nothere\.safetensors: no such file"):
+        nerfdiff.load_scene("nothere.safetensors")
     with pytest.raises(AttributeError, match="no attribute 'lode'"):
         nerfdiff.lode  # noqa: B018

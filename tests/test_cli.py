@@ -76,9 +76,11 @@ def test_the_papers_numbers():
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("modle=tiny", ["modle is not a key", "did you mean model?", "conditioning"]),
-        ("optimizer.lrr=1", ["optimizer.lrr is not a key", "optimizer.lr?", "warmup_steps"]),
-        ("model.unet.wdith=64", ["model.unet.width?", "channel_mult"]),
+        ("modle=tiny", ["modle is not a key; did you mean model? --cfg job shows all"]),
+        ("optimizer.lrr=1", ["optimizer.lrr is not a key", "optimizer.lr?"]),
+        ("model.unet.wdith=64", ["model.unet.width?"]),
+        ("optimizer.frobnicate=1", ["is not a key. Keys of optimizer: ", "warmup_steps"]),
+        ("model=smal", ["there is no model/smal; did you mean small? Choices: base"]),
         ("seed.x=1", ["seed.x is not a key", "it is a value"]),
         ("model=huge", ["base", "large", "small", "tiny"]),
         ("trainer.max_steps=many", ["trainer.max_steps takes int", "'many'"]),

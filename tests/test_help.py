@@ -9,6 +9,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from nerfdiff.cli import CONF, _composed, check_overrides, choices
+from nerfdiff.inputs import NO_SCENE
 from nerfdiff.quoting import gather_lists, quote_values
 from test_documents import commands
 
@@ -32,6 +33,9 @@ def test_help_is_one_screen_of_what_is_there(command, monkeypatch, capsys):
     assert 2 <= len(examples) == len(parts["Examples:"].splitlines()) <= 5
     for path, words in examples:
         assert path == f"src/{command}.py"
+        assert not any("=assets/" in word for word in words)  # which an installed command does not have
+        if command in ("train", "distill", "evaluate"):
+            assert any(word.startswith(("data.root=", "image=")) for word in words)  # or it ends with "no such folder"
         check_overrides(command, quote_values(gather_lists(command, words)))  # which composes
 
     config = _composed(command)
@@ -42,4 +46,6 @@ def test_help_is_one_screen_of_what_is_there(command, monkeypatch, capsys):
         assert name in list(OmegaConf.select(config, node) if node else config), key
     groups = parts.get("Groups, of which one is chosen by group=name:", "")
     for group, names in re.findall(r"^  (\w+)  +(.+(?:\n {5,}.+)*)", groups, re.M):
-        assert (CONF / group).is_dir() and names.replace("\n", " ").replace(",", "").split() == choices(group)
+        assert (CONF / group).is_dir() and names.replace("\n", " ").replace(",", "").split() == [
+            name for name in choices(group) if command != "picture" or name not in NO_SCENE
+        ]

@@ -3,6 +3,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from hydra._internal.utils import get_args_parser
 
 from nerfdiff.cli import prepare_arguments
 from nerfdiff.commands import distill, evaluate, export, inspect_data, train
@@ -67,6 +68,14 @@ def test_what_is_missing_is_said_at_once(command, words, message):
 )
 def test_what_is_there_or_the_jobs_own_passes(command, words):
     prepare_arguments(command, INPUTS[command], words)
+
+
+@pytest.mark.parametrize("words", ["-m A B", "A B -m", "A -m", "--multirun A", "A B --config-dir=scenes -m"])
+def test_the_words_of_a_sweep_are_hydras_wherever_m_stands(words):
+    words = words.replace("A", "data.root=scenes").replace("B", "seed=0,1").split()
+    prepared = prepare_arguments("train", INPUTS["train"], words)
+    found = get_args_parser().parse_args(prepared)
+    assert found.multirun and len(found.overrides) == sum("=" in word and word[0] != "-" for word in words) + 1
 
 
 def test_a_command_says_so_before_it_imports_anything_slow():

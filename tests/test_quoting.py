@@ -83,6 +83,11 @@ def test_lists_are_written_with_commas_and_are_no_sweeps(tmp_path, monkeypatch):
         Path(name).touch()
         assert listed("export", f"field={name}", "format=glb,ply") == {"fields": [name], "format": ["glb", "ply"]}
     assert listed("export", "field=x.safetensors,y z.safetensors") == {"fields": ["x.safetensors", "y z.safetensors"]}
+    assert listed("view", "fields=a/x.safetensors") == {"fields": ["a/x.safetensors"]}
+    assert listed("export", "fields=x,y") == listed("export", "fields=[x,y]") == {"fields": ["x", "y"]}
+    box = {"images": ["a.jpg"], "box": [100, 100.5, 2000, 2000]}
+    assert listed("picture", "a.jpg", "box=100,100.5,2000,2000") == box
+    assert listed("picture", "a.jpg", "box=[100,100.5,2000,2000]") == box
     assert listed("export", "field=[x,y]", "format=[glb]") == {"fields": ["x", "y"], "format": ["glb"]}
     assert listed("picture", *NAMES, "elevation=8") == {"images": NAMES, "elevation": 8}
     assert listed("picture", "image=a.jpg,b.jpg") == {"images": ["a.jpg", "b.jpg"]}

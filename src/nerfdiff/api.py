@@ -11,6 +11,9 @@ Nothing is written but what is asked for. The settings are those of `conf/pictur
 
 import copy
 import logging
+import math
+import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -31,11 +34,11 @@ from nerfdiff.evaluation.distill import build_strategy
 from nerfdiff.evaluation.progress import SceneProgress
 from nerfdiff.evaluation.run import autocast, choose_device, framed_as_trained, picture_scene
 from nerfdiff.exported_model import LoadedModel
-from nerfdiff.exports.export import FORMATS, FieldExport
+from nerfdiff.exports.export import FieldExport
 from nerfdiff.exports.views import render_rgba, to_image
 from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.fit.saved_field import SavedField, load_field, save_field
-from nerfdiff.stability.familiar import Familiar
+from nerfdiff.inputs import FORMATS, check_file, check_picture_settings
 from nerfdiff.stability.judge import OK
 from nerfdiff.stability.mend import mend_of
 from nerfdiff.trajectories import Upright
@@ -66,7 +69,7 @@ def load_scene(path: str | Path, device: str = "auto") -> "Scene":
     """Read a scene that `Scene.save` or `distill.py` wrote (`field.safetensors`).
 
     Raises:
-        DataError: it is none.
+        DataError: there is no such file, or it is none.
     """
     saved = load_field(path)
     return Scene(replace(saved, field=saved.field.to(choose_device(device))))
@@ -78,6 +81,9 @@ class Model:
 
     loaded: LoadedModel
     device: torch.device
+
+    def __repr__(self) -> str:
+        return f"Model({self.loaded.path}: {self.loaded.brief()}; on {self.device})"
 
     def distil(
         self,
@@ -94,11 +100,12 @@ class Model:
         """Make a scene of one picture of an object, in about half a minute on a CPU core with `ckpt=demo`.
 
         Args:
-            picture: with a transparent background, or on white, or with a mask; else the object is cut out, which a
-                log line says (`Scene.mask`).
+            picture: file, with a transparent background, or on white, or with a mask; else the object is cut out, which
+                a logged warning says (`Scene.mask`).
             strategy: `ngd_current`, `ngd`, `direct`, `sds`, `stochastic` or `none`.
             budget: how much it may compute: `minutes` or `paper`.
-            elevation: degrees from which the picture looks down at the object; None: estimated, which a log line says.
+            elevation: degrees from which the picture looks down at the object; None: estimated, which a logged
+                warning says.
             mask: file of the picture's size, white where the object is.
             box: [left, top, right, bottom] in pixels, in which the object lies.
             seed: of all noise.
@@ -106,13 +113,20 @@ class Model:
 
         Raises:
             DataError: the picture cannot be read, or no object stands out in it.
-            ConfigError: settings that cannot be, or a strategy that leaves no scene.
+            ConfigError: arguments or settings that cannot be, or a strategy that leaves no scene.
         """
+        for key, file in (("picture", picture), ("mask", mask)):
+            if file is not None or key == "picture":
+                _check_path(key, file)
+        if isinstance(settings, str) or not all(isinstance(word, str) and "=" in word for word in settings):
+            raise ConfigError(f'settings={settings!r}: expected a list of key=value, as ["budget.steps=32"]')
         words = [f"ckpt={self.loaded.path}", f"strategy={strategy}", f"budget={budget}", f"seed={seed}"]
-        words += [] if elevation is None else [f"elevation={float(elevation)}"]
+        words += [] if elevation is None else [f"elevation={_degrees(elevation)}"]
         words += [] if mask is None else [f"mask={mask}"]
-        words += [] if box is None else [f"box={list(box)}"]
-        return self.distil_batch(*self.prepare(load_config("picture", [*words, *settings]), picture))
+        words += [] if box is None else [f"box={_box(box)}"]
+        cfg = load_config("picture", [*words, *settings])
+        check_picture_settings(cfg)
+        return self.distil_batch(*self.prepare(cfg, picture))
 
     def prepare(self, cfg: DictConfig, picture: str | Path) -> tuple[DictConfig, ViewBatch, Mask | None]:
         """Frame a picture as this model's training images were, and cut it out where that is needed.
@@ -135,7 +149,7 @@ class Model:
         except BackgroundError:
             mask = _cut_out(cfg, picture)
             scene = picture_scene(cfg, self.loaded, size, mask.where)
-        if (mend := mend_of(cfg, Familiar.beside(self.loaded.path))) is not None:
+        if (mend := mend_of(cfg, self.loaded.familiar)) is not None:
             scene = mend(scene)
         return cfg, scene.to(self.device), mask
 
@@ -145,12 +159,15 @@ class Model:
         self.loaded.model.renderer = replace(self.loaded.model.renderer, skip=cfg.skip)
         with SceneProgress(strategy.name, 1, cfg.progress_every) as progress, autocast(self.device, precision):
             callbacks = [*progress.callbacks(1), *([kept] if kept.count else ())]
-            (views,) = strategy.predict(self.loaded.model, [batch], cfg.seed, callbacks)
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated")  # in Lightning
+                (views,) = strategy.predict(self.loaded.model, [batch], cfg.seed, callbacks)
+            progress.advance("")
         if views.field is None:
             raise ConfigError(f"strategy={strategy.name} leaves no scene: choose one that does, as ngd_current")
         if views.status != "ok":
             log.warning("the fit was %s: this is the last field before that", views.status)
-        judge, familiar = instantiate(cfg.judge), Familiar.beside(self.loaded.path)
+        judge, familiar = instantiate(cfg.judge), self.loaded.familiar
         with autocast(self.device, precision):
             verdict = judge.verdict(judge.signs(self.loaded.model, batch, views, familiar, cfg.seed), views.status)
         if verdict != OK:
@@ -161,10 +178,35 @@ class Model:
         return Scene(replace(views.field, stands=stands), picture, mask, views.status, verdict, steps)
 
 
+def _check_path(key: str, file: object) -> None:
+    if not isinstance(file, str | os.PathLike):
+        raise ConfigError(
+            f"{key}={type(file).__name__}: expected the path of a file; save the image, and give its path"
+        )
+    check_file(key, os.fspath(file), "name a picture")
+
+
+def _degrees(elevation: object) -> float:
+    try:
+        if math.isfinite(degrees := float(elevation)):
+            return degrees
+    except (TypeError, ValueError):
+        pass
+    raise ConfigError(f"elevation={elevation!r}: expected degrees above the ground, as 30, or None")
+
+
+def _box(box: object) -> list[float]:
+    try:
+        edges = [float(edge) for edge in box]
+    except (TypeError, ValueError):
+        edges = []
+    if len(edges) != 4 or not all(map(math.isfinite, edges)):
+        raise ConfigError(f"box={box!r}: expected [left, top, right, bottom] in pixels")
+    return edges
+
+
 def _cut_out(cfg: DictConfig, picture: str | Path) -> Mask:
     """Find the object of a picture whose background is neither transparent nor white, or in a box of it."""
-    if cfg.mask is not None:
-        raise ConfigError(f"box={list(cfg.cutout.box)} and mask={cfg.mask} both say where the object is: give one")
     mask = instantiate(cfg.cutout).find(picture)
     doubts = "".join(f"; {doubt}" for doubt in mask.doubts)
     log.warning(
@@ -208,6 +250,11 @@ class Scene:
     status: str = "ok"
     verdict: str | None = None
     steps: Mapping[int, RefinedField] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        field = self.saved.field
+        verdict = "" if self.verdict is None else f"; {self.verdict}"
+        return f"Scene({field.cameras.height}x{field.cameras.width} pixels, on {field.K.device}{verdict})"
 
     def render(self, azimuth: float = 0.0, elevation: float | None = None, height: int | None = None) -> Image.Image:
         """A picture of the scene with a transparent background.

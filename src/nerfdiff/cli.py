@@ -7,7 +7,7 @@ import re
 import shlex
 import sys
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +23,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from nerfdiff.inputs import CHECKOUT, CONF, check_inputs, check_output
+from nerfdiff.inputs import CHECKOUT, CONF, NO_SCENE, check_inputs, check_output
 from nerfdiff.limits import check_limit, check_limits
 from nerfdiff.noise import quieten
 from nerfdiff.quoting import gather_lists, parse_override, quote_values
@@ -130,10 +130,10 @@ def job_folder(swept: str, overrides: Sequence[str] = ()) -> str:
     return "-".join(filter(None, [name, sha256_values([swept, *sorted(overrides)])[:8]]))
 
 
-def group_lines(*groups: str) -> str:
+def group_lines(*groups: str, without: Collection[str] = ()) -> str:
     """Config groups with their choices, as a command's help shows them."""
     width = max(map(len, groups)) + 4
-    lines = (f"  {group}".ljust(width) + ", ".join(choices(group)) for group in groups)
+    lines = (f"  {group}".ljust(width) + ", ".join(n for n in choices(group) if n not in without) for group in groups)
     return "\n".join(textwrap.fill(line, 100, subsequent_indent=" " * width, break_on_hyphens=False) for line in lines)
 
 
@@ -141,6 +141,7 @@ OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
 # of the commands' help
 OmegaConf.register_new_resolver("command", lambda name: " ".join(command_words(name)), replace=True)
 OmegaConf.register_new_resolver("groups", group_lines, replace=True)
+OmegaConf.register_new_resolver("scene_groups", functools.partial(group_lines, without=NO_SCENE), replace=True)
 OmegaConf.register_new_resolver("all_shards", lambda of: ",".join(f"{n}/{of}" for n in range(1, of + 1)), replace=True)
 
 
@@ -237,7 +238,10 @@ def prepare_arguments(config_name: str, inputs: Sequence[str], arguments: list[s
     check_inputs(config, inputs, swept=swept | set(config.hydra.sweeper.get("params") or ()), only=fixed)
     # jobs, in whatever process, are to name their folders by what is swept
     untold = [key for key, override in fixed.items() if not override.is_hydra_override()]
-    return [*arguments, f"{EXCLUDED}=[{','.join(untold)}]"]
+    # beside other overrides: argparse takes them from one place only, be it before -m or behind it
+    places = [n for n, word in enumerate(arguments, 1) if not word.startswith("-") and "=" in word]
+    place = places[-1] if places else len(arguments)
+    return [*arguments[:place], f"{EXCLUDED}=[{','.join(untold)}]", *arguments[place:]]
 
 
 def _overrides(arguments: list[str]) -> list[Override]:
@@ -325,8 +329,10 @@ def _compose(config_name: str, overrides: list[str], with_hydra: bool = False) -
         with initialize_config_dir(str(CONF), version_base="1.3"):
             return compose(config_name, overrides, return_hydra_config=with_hydra)
     except MissingConfigException as error:
-        choices = f"; choices: {', '.join(error.options)}" if error.options else ""
-        raise ConfigError(f"there is no {error.missing_cfg_file}{choices}") from error
+        listed = ", ".join(error.options or ())
+        close = difflib.get_close_matches(str(error.missing_cfg_file).rpartition("/")[2], error.options or (), 1)
+        others = f"; did you mean {close[0]}? Choices: {listed}" if close else f"; choices: {listed}" if listed else ""
+        raise ConfigError(f"there is no {error.missing_cfg_file}{others}") from error
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_one_line(error, error.__cause__ or "")) from error
     finally:
@@ -366,8 +372,11 @@ def _check_value(config: DictConfig, override: Override) -> None:
             close = difflib.get_close_matches(part, keys, 1)
             raise ConfigError(
                 f"{override.key_or_group} is not a key"
-                + (f"; did you mean {'.'.join([*seen, close[0]])}?" if close else "")
-                + f" Keys of {where or 'the config'}: {', '.join(keys) or 'none (it is a value)'}"
+                + (
+                    f"; did you mean {'.'.join([*seen, close[0]])}? --cfg job shows all"
+                    if close
+                    else f". Keys of {where or 'the config'}: {', '.join(keys) or 'none (it is a value)'}"
+                )
             )
         seen.append(part)
         raw = node._get_node(part)

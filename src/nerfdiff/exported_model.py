@@ -1,7 +1,8 @@
 """Exported models: weights as safetensors, with the settings that rebuild the model."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from safetensors.torch import load_file, save_file
 
 from nerfdiff.inputs import WEIGHTS
 from nerfdiff.model import NerfDiff
+from nerfdiff.stability.familiar import Familiar
 from nerfdiff.utils.errors import CheckpointError, ConfigError
 from nerfdiff.utils.files import atomic, write_text
 from nerfdiff.utils.hashes import sha256_file, sha256_values
@@ -37,13 +39,28 @@ class LoadedModel:
         trained_on: one entry for each training that led to it (`NerfDiffModule.trained_on`), where that was recorded.
     """
 
-    model: NerfDiff
+    model: NerfDiff = field(repr=False)
     path: Path
     weights: str
-    config: Mapping
+    config: Mapping = field(repr=False)
     image_size: list[int] | None
     stability: Mapping[str, float | int | None]
-    trained_on: Sequence[Mapping[str, Any]] = ()
+    trained_on: Sequence[Mapping[str, Any]] = field(default=(), repr=False)
+
+    @cached_property
+    def familiar(self) -> Familiar | None:
+        """What is known of the training images, read once; None where nothing lies beside the weights.
+
+        Raises:
+            DataError: it is damaged.
+        """
+        return Familiar.beside(self.path)
+
+    def brief(self) -> str:
+        """A few words on what the model is for."""
+        size = f"{self.image_size[0]}x{self.image_size[1]} pixels, " if self.image_size else ""
+        last = self.trained_on[-1] if self.trained_on else {"about": "what was not recorded"}
+        return f"{size}trained on {last['about'] or last['dataset']}"
 
     def describe(self) -> str:
         """One line on what the model has seen."""

@@ -1,7 +1,7 @@
 """Files and folders that commands read, looked for without importing anything slow."""
 
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,9 @@ CHECKOUT = None if (PACKAGE / "conf").is_dir() else PACKAGE.parents[1]
 
 CONF, ASSETS = ((CHECKOUT or PACKAGE) / name for name in ("conf", "assets"))
 WEIGHTS = "model.safetensors"
+FORMATS = ("glb", "obj", "ply", "html", "mp4", "gif", "png")
+NO_SCENE = ("cdm", "copy_input", "mean_image")
+"""Strategies that predict views and leave no field."""
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
 
 
@@ -81,15 +84,43 @@ def check_inputs(
                     raise DataError(f"results={place}: no such file or folder; name folders of runs, or their files")
         else:
             for file in [value] if isinstance(value, str) else value:
-                _check_file(key, file, "name a field.safetensors" if key == "fields" else "name a picture")
+                check_file(key, file, "name a field.safetensors" if key == "fields" else "name a picture")
 
 
-def _check_file(key: str, file: str, instead: str) -> None:
+def check_file(key: str, file: str, instead: str) -> None:
+    """Raise DataError where there is no such file; `instead` says what to do."""
     if not Path(file).is_file():
         what = "no such file"
         if Path(file).exists():
             what = "is a folder" if Path(file).is_dir() else "is no ordinary file"
         raise DataError(f"{key}={file}: {what}; {instead}")
+
+
+def check_formats(formats: Collection[str]) -> None:
+    """Raise ConfigError where a format is not one of `FORMATS`."""
+    if unknown := sorted(set(formats) - set(FORMATS)) or not formats:
+        raise ConfigError(f"format={unknown if formats else '[]'}: expected some of {', '.join(FORMATS)}")
+
+
+def check_picture_settings(cfg: DictConfig) -> None:
+    """Raise ConfigError where `conf/picture.yaml`'s settings leave no scene, or say twice where the object is."""
+    box = cfg.cutout.box
+    if cfg.strategy.name in NO_SCENE:
+        raise ConfigError(f"strategy={cfg.strategy.name} leaves no scene: choose one that does, as ngd_current")
+    if box is not None and (len(box) != 4 or not all(isinstance(edge, int | float) for edge in box)):
+        raise ConfigError(f"box={list(box)}: expected [left, top, right, bottom] in pixels")
+    if box is not None and cfg.mask is not None:
+        raise ConfigError(f"box={list(box)} and mask={cfg.mask} both say where the object is: give one")
+
+
+def check_box(box: Sequence[float], height: int, width: int) -> None:
+    """Raise ConfigError where [left, top, right, bottom] are not within a picture, or too near to each other."""
+    left, top, right, bottom = box
+    if not (0 <= left < right <= width and 0 <= top < bottom <= height) or min(right - left, bottom - top) < 8:
+        raise ConfigError(
+            f"box={list(box)}: expected [left, top, right, bottom] in pixels, at least 8 apart, within the "
+            f"picture's {width}x{height} (width x height, as it is shown)"
+        )
 
 
 def check_output(cfg: DictConfig) -> None:

@@ -16,13 +16,14 @@ from nerfdiff.cli import command_words
 from nerfdiff.data.cutout import Mask, write_mask
 from nerfdiff.data.picture import scene_id
 from nerfdiff.evaluation.dashboard import show_picture
-from nerfdiff.exports.export import FieldExport, check_formats
+from nerfdiff.exports.export import FieldExport
 from nerfdiff.exports.views import over, render_rgba
 from nerfdiff.fit.saved_field import FIELD, STEPS, save_steps
 from nerfdiff.results.pictures import contact_sheet
 from nerfdiff.stability.judge import OK
+from nerfdiff.stopping import Stopped
 from nerfdiff.utils.config import plain
-from nerfdiff.utils.errors import ConfigError, DataError, UserError
+from nerfdiff.utils.errors import DataError, UserError
 from nerfdiff.utils.files import write_text
 from nerfdiff.utils.hashes import sha256_file, sha256_values
 
@@ -36,35 +37,33 @@ log = logging.getLogger(__name__)
 def pictures(cfg: DictConfig) -> list[Path]:
     """Make a folder of every picture `cfg.images`; return the folders.
 
-    A scene that is there, made by the same settings of the same picture, is kept. A picture that fails leaves the
-    others alone.
+    A scene that is there, made by the same settings of the same picture, is kept. A picture that cannot be used leaves
+    the others alone.
 
     Raises:
         UserError: settings that cannot be; after all pictures, that some failed.
+        Stopped: says how many pictures are complete.
     """
-    check_formats(cfg.format)
-    if not cfg.images:
-        raise ConfigError(f"name a picture: {' '.join(command_words('picture'))} car.jpg")
-    for key in ("mask", "box"):
-        if cfg[key] is not None and len(cfg.images) > 1:
-            raise ConfigError(
-                f"{key}={cfg[key]} is of one picture, and there are {len(cfg.images)}: give one at a time"
-            )
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
     model = load(cfg.ckpt, cfg.device, cfg.weights)
-    log.info("ckpt=%s", model.loaded.describe())
+    log.info("ckpt=%s: %s", cfg.ckpt, model.loaded.brief())
+    log.debug("ckpt=%s", model.loaded.describe())
     made, failed = [], []
     for image, folder in zip(cfg.images, folders(cfg.images, Path(cfg.out)), strict=True):
         try:
             _make(cfg, model, Path(image), folder)
             made.append(folder)
         except UserError as error:
-            failed.append(str(error))
+            if len(cfg.images) == 1:
+                raise
+            failed.append(image)
             log.error("%s", error)
+        except Stopped as stopped:
+            done = f"{len(made)} of {len(cfg.images)} pictures are complete; a scene in the making begins anew."
+            raise Stopped(stopped.signum, done) from None
     if failed:
-        some = f"{len(failed)} of {len(cfg.images)} pictures failed, see above" if len(cfg.images) > 1 else failed[0]
-        raise DataError(some)
+        raise DataError(f"{len(failed)} of {len(cfg.images)} pictures failed, see above")
     return made
 
 
@@ -131,10 +130,12 @@ def _kept(folder: Path, identity: str, model: Model) -> Scene | None:
 
 
 def _views(scene: Scene, source: torch.Tensor, path: Path) -> Path:
-    """The picture, and the scene from all around, in a row."""
+    """The picture, and the scene from all around, in two rows."""
     field, stands = scene.saved.field, scene.saved.stands
     azimuth = torch.arange(AROUND) * (360 / AROUND)
     cameras = stands.around(field.cameras.to("cpu"), azimuth, None).to(field.K.device)
     shown = over(render_rgba(scene.saved, cameras, cameras.height), 1.0)
-    columns = {f"{angle:.0f}°": view[None] for angle, view in zip(azimuth.tolist(), shown, strict=True)}
-    return contact_sheet(path, {"picture": source[None]} | columns)
+    half = AROUND // 2
+    columns = {f"+ {angle:.0f}°": shown[n::half] for n, angle in enumerate(azimuth[:half].tolist())}
+    picture = torch.stack([source, torch.ones_like(source)])
+    return contact_sheet(path, {"picture": picture} | columns, ["0°", "180°"], min_cell=256)

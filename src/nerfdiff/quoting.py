@@ -14,11 +14,14 @@ PATHS = re.compile(r"ckpt|init|kept_renderings|image|mask|out|root|results|run|d
 """Last parts of the keys that take paths."""
 
 LISTS: dict[str, dict[str, str]] = {
-    "export": {"field": "fields", "format": "format"},
-    "view": {"field": "fields"},
+    "export": {"field": "fields", "fields": "fields", "format": "format"},
+    "view": {"field": "fields", "fields": "fields"},
     "picture": {"image": "images", "images": "images", "format": "format"},
 }
 """By commands: words that take a list, and their keys, which differ where a group of configs has the word."""
+
+NUMBERS: dict[str, tuple[str, ...]] = {"picture": ("box",)}
+"""By commands: keys that take several numbers, which are no sweep."""
 
 BARE: dict[str, str] = {"picture": "images"}
 """By commands: the key that words without a key are values of."""
@@ -35,7 +38,7 @@ def quote_values(words: Sequence[str]) -> list[str]:
 
 
 def gather_lists(command: str, words: Sequence[str]) -> list[str]:
-    """Write the values of `LISTS` and `BARE` as Hydra's lists: `format=glb,ply` is no sweep there."""
+    """Write the values of `LISTS`, `NUMBERS` and `BARE` as Hydra's lists: `format=glb,ply` is no sweep there."""
     lists, bare = LISTS.get(command, {}), BARE.get(command)
     found: dict[str, list[str]] = {}
     others = []
@@ -43,6 +46,8 @@ def gather_lists(command: str, words: Sequence[str]) -> list[str]:
         key, equals, value = word.partition("=")
         if bare and not word.startswith(("-", "~")) and not before.startswith("-") and (not equals or isfile(word)):
             found.setdefault(bare, []).append(word)
+        elif key in NUMBERS.get(command, ()) and "," in value and value[:1] not in ("[", "'", '"'):
+            others.append(f"{key}=[{value}]")
         elif key not in lists or not equals:
             others.append(word)
         elif not (whole := os.path.exists(os.path.expanduser(value))) and value[:1] in ("[", "'", '"'):

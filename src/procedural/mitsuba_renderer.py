@@ -78,7 +78,7 @@ def resolve_variant(variant: str) -> str:
         import drjit
         import mitsuba
     except ModuleNotFoundError as error:
-        raise ConfigError('rendering scenes needs Mitsuba: pip install "nerfdiff[scenes]"') from error
+        raise ConfigError("rendering scenes needs Mitsuba: pip install mitsuba") from error
 
     if variant == "auto":
         return "cuda_ad_rgb" if drjit.has_backend(drjit.JitBackend.CUDA) else "scalar_rgb"

@@ -70,6 +70,25 @@ def test_a_box_says_which_object_is_meant(tmp_path):
             cut_out(box=box).find(tmp_path / "two.png")
 
 
+@pytest.mark.parametrize("size", [(1, 1), (2, 2), (3, 3), (7, 40), (2, 300), (300, 2), (29, 300), (16, 2000)])
+@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
+@pytest.mark.filterwarnings("error")
+def test_a_picture_without_room_for_an_object_is_refused(tmp_path, size, mode):
+    pixels = np.random.default_rng(0).integers(0, 255, (*size, len(mode)), np.uint8)
+    pixels[..., 3:] = 255
+    Image.fromarray(pixels).save(tmp_path / "one.png")
+    said = rf"one\.png: {size[1]}x{size[0]} pixels .* at least \d+\. Give a larger picture"
+    with pytest.raises(DataError, match=said):
+        cut_out().find(tmp_path / "one.png")
+
+
+@pytest.mark.parametrize("size", [(8, 8), (30, 300), (300, 31), (200, 2000)])
+def test_a_narrow_picture_is_looked_at(tmp_path, size):
+    Image.new("RGB", size, (90, 90, 90)).save(tmp_path / "grey.png")
+    with pytest.raises(DataError, match="no object stands out"):
+        cut_out().find(tmp_path / "grey.png")
+
+
 def test_a_photograph_held_upright_is_cut_out_upright(tmp_path):
     truth = photograph(*wagon(), tmp_path / "car.jpg", (300, 400), (0.4, 0.5), 0.7, 0)
     image = Image.open(tmp_path / "car.jpg")
@@ -137,5 +156,5 @@ def test_a_networks_weights_are_taken_where_they_are_and_never_fetched(tmp_path,
     cut_out(weights=own).find(tmp_path / "car.jpg")
     assert asked[-1] == ("u2net_custom", {"model_path": own})
     monkeypatch.setitem(sys.modules, "rembg", None)
-    with pytest.raises(ConfigError, match=r"pip install 'nerfdiff\[cutout\]'"):
+    with pytest.raises(ConfigError, match=r"pip install 'rembg\[cpu\]'"):
         cut_out().find(tmp_path / "car.jpg")

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import io
 import json
 import os
 import re
@@ -24,6 +25,7 @@ from nerfdiff.distill.distillation import Distillation
 from nerfdiff.distill.module import NGDModule
 from nerfdiff.distill.priors import Sphere
 from nerfdiff.evaluation.distill import _warn_of_unused, distill
+from nerfdiff.evaluation.progress import SceneProgress
 from nerfdiff.evaluation.run import dataset_run, picture_run
 from nerfdiff.fit.saved_field import FIELD, load_field
 from nerfdiff.metrics.predictions import read_prediction
@@ -228,9 +230,30 @@ def test_a_distillation_says_how_far_it_is(data, run, tmp_path, caplog):
     caplog.set_level("INFO")
     distill(config(data, run, tmp_path, "progress_every=1e-9"))
     lines = [record.message for record in caplog.records if record.name == "nerfdiff.evaluation.progress"]
-    assert re.fullmatch(r"ngd: scene 1 of 2, step 1 of 3, t 1\.00, renders against targets .* dB, .* left", lines[0])
+    assert re.fullmatch(r"ngd: scene 1 of 2, step 1 of 3, .* left, t 1\.00, renders against targets .* dB", lines[0])
     assert re.fullmatch(r"ngd: scene 2 of 2, step 3 of 3, .* left|ngd: scene 2 of 2, step 3 of 3, .* dB", lines[-2])
     assert re.fullmatch(r"ngd: scene 2 of 2, PSNR [\d.]+", lines[-1]) and len(lines) == 2 * (STEPS + 1)
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(("name", "total"), [("ngd_current", 1), ("ngd_equation", 24)])
+def test_the_bar_fits_a_terminal_of_80_columns(name, total, monkeypatch):
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("TERM", "xterm")
+    with SceneProgress(name, total, 60.0) as progress:
+        for _ in range(total - 1):
+            progress.advance("PSNR 25.11")
+        (bar,) = progress.callbacks(1)
+        bar.report(10 / 16, "step 10 of 16", "t 0.40, renders against targets 25.3 dB")
+    line = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", terminal.getvalue()).strip().splitlines()[-1].rpartition("\r")[2]
+    assert len(line) <= 80 and line.count("━") + line.count("╸") + line.count("╺") >= 16
+    assert line.startswith(f"{name} ") and "step 10 of 16, " in line and " left" in line
+    assert total == 1 or f"scene {total} of {total}" in line
 
 
 def test_scenes_fitted_together_are_what_they_are_alone(data, run, tmp_path):

@@ -228,13 +228,14 @@ def test_fields_stand_side_by_side_from_one_camera_and_may_be_left_out(pane):
         assert browser.picture().min() > 0.97
 
 
-def test_files_are_served_with_their_steps(tmp_path, pane):
+def test_files_are_served_with_their_steps(tmp_path, pane, capsys):
     plain = replace(pane.saved, field=pane.saved.field.alone(0))
     for strategy in ("ngd", "none"):
         save_field(tmp_path / strategy / "car" / FIELD, plain)
     save_steps(tmp_path / "ngd" / "car", plain, {0: plain.field, 8: plain.field})
     fields = [str(tmp_path / strategy / "car" / FIELD) for strategy in ("ngd", "none")]
     viewer = open_viewer(load_config("view", [f"field={','.join(fields)}", "port=0", "device=cpu"]))
+    assert capsys.readouterr().out == ""  # `view` says the address
     browser = Browser(viewer.server.get_port())
     browser.look(viewer.panes[0].pose())
     browser.picture()
@@ -266,5 +267,5 @@ def test_what_cannot_be_is_said(tmp_path, monkeypatch):
         with pytest.raises(ConfigError, match=wrong.partition("=")[0]):
             load_config("view", [wrong])
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(ConfigError, match=r"pip install 'nerfdiff\[view\]'"):
+    with pytest.raises(ConfigError, match="needs viser: pip install viser"):
         LiveViewer([], SETTINGS, "127.0.0.1", 0)

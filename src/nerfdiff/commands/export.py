@@ -6,6 +6,7 @@ Or a scene for other programs: `python src/export.py field=field.safetensors for
 from omegaconf import DictConfig
 
 from nerfdiff.cli import entry_point
+from nerfdiff.inputs import check_formats
 from nerfdiff.utils.errors import ConfigError
 
 
@@ -15,6 +16,7 @@ def main(cfg: DictConfig) -> None:
     if (cfg.ckpt is None) == (not cfg.fields):
         raise ConfigError("say what to export: ckpt=<checkpoint> for a model's weights, or field=<field.safetensors>")
     if cfg.fields:
+        check_formats(cfg.format)
         from nerfdiff.exports.export import export_fields  # slow to import: not for --cfg
 
         print(*export_fields(cfg, cfg.fields), sep="\n")

@@ -1,5 +1,6 @@
 """The object of a photograph, found before whatever background: by a network, or by what the border looks like."""
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from skimage.morphology import convex_hull_image
 
 from nerfdiff.data.formats.images import decode_with_alpha
 from nerfdiff.data.random_walk import Mixture, RandomWalk, refined, shrunk
+from nerfdiff.inputs import check_box
 from nerfdiff.utils.errors import ConfigError, DataError
 from nerfdiff.utils.files import atomic
 
@@ -41,6 +43,10 @@ class Mask:
     where: Bool[np.ndarray, "height width"]
     how: str
     doubts: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        height, width = self.where.shape
+        return f"Mask({height}x{width} pixels, {self.where.mean():.0%} of them the object, found {self.how})"
 
 
 @dataclass(frozen=True)
@@ -128,12 +134,8 @@ class CutOut:
         """Return the part of a picture that is looked at, and where in it the box is."""
         if self.box is None:
             return (slice(None), slice(None)), None
-        (height, width), (left, top, right, bottom) = shape, (round(edge) for edge in self.box)
-        if not (0 <= left < right <= width and 0 <= top < bottom <= height) or min(right - left, bottom - top) < 8:
-            raise ConfigError(
-                f"box={list(self.box)}: expected [left, top, right, bottom] in pixels, at least 8 apart, within the "
-                f"picture's {width}x{height} (width x height, as it is shown)"
-            )
+        check_box(self.box, *shape)
+        left, top, right, bottom = (round(edge) for edge in self.box)
         where = np.zeros(shape, bool)
         where[top:bottom, left:right] = True
         window = _around(where)
@@ -155,6 +157,7 @@ class CutOut:
         if within is not None:
             found = self._fine(pixels, self._closer(pixels, within, 1.0)) & within
         else:
+            self._refuse_narrow(path, pixels.shape[:2])
             first = self._best(pixels)
             doubts = first.doubts(self)
             if first.score < self.clear:
@@ -167,6 +170,20 @@ class CutOut:
                 found = np.zeros_like(found)
                 found[window] = closer
         return found, doubts
+
+    def _band(self, longer: int) -> int:
+        """Return the border's pixels of a shrunken picture."""
+        return max(2, round(self.border * longer))
+
+    def _refuse_narrow(self, path: str | Path, shape: tuple[int, int]) -> None:
+        """Raise DataError where the border leaves no room for an object."""
+        longer = max(shape)
+        least = math.ceil((2 * self._band(min(longer, self.side)) + 4) * max(1.0, longer / self.side))
+        if min(shape) < least:
+            raise DataError(
+                f"{path}: {shape[1]}x{shape[0]} pixels (width x height) are too few to find an object in; its shorter "
+                f"side needs at least {least}. Give a larger picture, or one with more around the object"
+            )
 
     def _fine(self, pixels, share) -> Bool[np.ndarray, "height width"]:
         return _main_part(refined(pixels, share, self.fine))
@@ -191,7 +208,7 @@ class CutOut:
         """Read a picture in both ways, and return the better reading."""
         lab = self._lab(pixels)
         height, width, _ = lab.shape
-        band = max(2, round(self.border * max(height, width)))
+        band = self._band(max(height, width))
         edge = np.ones((height, width), bool)
         edge[band:-band, band:-band] = False
         down, right = np.mgrid[:height, :width]
@@ -289,7 +306,7 @@ def _by_network(
     try:
         import rembg
     except ImportError as error:
-        raise ConfigError("a network's weights are there, but rembg is not: pip install 'nerfdiff[cutout]'") from error
+        raise ConfigError("a network's weights are there, but rembg is not: pip install 'rembg[cpu]'") from error
     session = rembg.new_session(name, **({} if weights is None else {"model_path": str(weights)}))
     found = rembg.remove(Image.fromarray(pixels), session=session, only_mask=True)
     return np.asarray(found.convert("L")) > 127

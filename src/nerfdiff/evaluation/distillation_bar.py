@@ -10,11 +10,11 @@ class DistillationBar(Callback):
     """Report the step, t, and the PSNR of the fields' renderings against their targets.
 
     Args:
-        report: receives the share of the steps that are done, and a text.
+        report: receives the share of the steps that are done, where it is, and what was reached, in words.
         every: seconds between reports, for which the host waits for the device.
     """
 
-    def __init__(self, report: Callable[[float, str], None], every: float):
+    def __init__(self, report: Callable[[float, str, str], None], every: float):
         self.report, self.every = report, every
         self._last = -float("inf")
 
@@ -23,7 +23,7 @@ class DistillationBar(Callback):
             return
         t, agreement = pl_module.progress()
         step, steps = batch_idx + 1, pl_module.steps
-        where = f"step {step} of {steps}" + ("" if t is None else f", t {t:.2f}")
-        reached = "" if agreement is None else f", renders against targets {agreement:.1f} dB"
-        self.report(step / steps, where + reached)
+        reached = [] if t is None else [f"t {t:.2f}"]
+        reached += [] if agreement is None else [f"renders against targets {agreement:.1f} dB"]
+        self.report(step / steps, f"step {step} of {steps}", ", ".join(reached))
         self._last = time.monotonic()

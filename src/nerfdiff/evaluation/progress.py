@@ -10,6 +10,7 @@ from types import TracebackType
 from lightning import Callback
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Column
 
 from nerfdiff.evaluation.distillation_bar import DistillationBar
 from nerfdiff.training.callbacks.progress import duration
@@ -34,11 +35,13 @@ class SceneProgress(AbstractContextManager):
         self._every = every if shown and not sys.stderr.isatty() else None
         columns = (
             TextColumn(name, markup=False),
-            BarColumn(),
+            BarColumn(16),
             TimeElapsedColumn(),
-            TextColumn("{task.description}", markup=False),
+            # takes the room that is left; what does not fit at its end is cut
+            TextColumn("{task.description}", markup=False, table_column=Column(ratio=1, no_wrap=True)),
         )
-        self._bar = Progress(*columns, console=Console(stderr=True), disable=not shown or self._every is not None)
+        hidden = not shown or self._every is not None
+        self._bar = Progress(*columns, console=Console(stderr=True), disable=hidden, expand=True)
         self._task = self._bar.add_task(self._where(), total=total)
 
     def __enter__(self) -> "SceneProgress":
@@ -53,27 +56,27 @@ class SceneProgress(AbstractContextManager):
         if self._every is None and self._bar.disable:
             return ()
 
-        def report(share: float, words: str) -> None:
+        def report(share: float, where: str, reached: str) -> None:
             self._within = share * scenes
-            self._update(words)
+            self._update(where, reached)
 
         return [DistillationBar(report, self._every or 0.5)]
 
     def advance(self, words: str) -> None:
         """Count one more scene as done."""
         self._done, self._within = self._done + 1, 0.0
-        self._update(words)
+        self._update(words or "done")
 
-    def _update(self, words: str) -> None:
+    def _update(self, where: str, reached: str = "") -> None:
         done, now = self._done + self._within, time.monotonic()
         left = ""
         if 0 < done < self.total:
             left = f"{duration((now - self._began) * (self.total - done) / done)} left"
-        said = ", ".join(word for word in (self._where(), words, left) if word)
+        said = ", ".join(word for word in (self._where(), where, left, reached) if word)
         self._bar.update(self._task, completed=done, description=said)
         if self._every is not None and (now - self._said >= self._every or done == self.total):
             log.info("%s: %s", self.name, said)
             self._said = now
 
     def _where(self) -> str:
-        return f"scene {min(self._done + 1, self.total)} of {self.total}"
+        return f"scene {min(self._done + 1, self.total)} of {self.total}" if self.total > 1 else ""

@@ -274,7 +274,7 @@ def framed_as_trained(cfg: DictConfig, loaded: LoadedModel) -> DictConfig:
     asked = [key for key, value in cfg.picture.items() if value == AUTO]
     if not asked:
         return cfg
-    familiar = Familiar.beside(loaded.path)
+    familiar = loaded.familiar
     known = familiar.framing() if familiar is not None else None
     if known is None:
         known = cfg.framing
@@ -295,7 +295,7 @@ def picture_scene(
     """The scene of the picture `cfg.image`, whose targets are the cameras of `cfg.picture_views`, not yet known.
 
     An elevation of `auto` is estimated by the model, or taken to be `cfg.usual_elevation` where it cannot; `cfg` then
-    has the number, and a log line says so.
+    has the number, and a warning says so.
 
     Args:
         size: (height, width) of the model's images.
@@ -316,7 +316,7 @@ def picture_scene(
 def _elevation(cfg: DictConfig, loaded: LoadedModel, scene: ViewBatch) -> float:
     """Estimate the degrees from which a picture looks down at its object."""
     key = "elevation" if "elevation" in cfg else "picture_views.source_elevation"
-    familiar = Familiar.beside(loaded.path)
+    familiar = loaded.familiar
     fit = None if familiar is None else familiar.elevation
     if fit is None or not fit.useful or familiar.framing() is None:
         log.warning(
@@ -332,7 +332,7 @@ def _elevation(cfg: DictConfig, loaded: LoadedModel, scene: ViewBatch) -> float:
         own = next(loaded.model.parameters()).device
         shown = framed(scene, familiar.framing()).to(own)
         found = round(float(fit(features(loaded.model.encode(shown)))[0]), 1)
-    log.info(
+    log.warning(
         "%s is estimated to look down from %g degrees at its object (of training images 9 of 10 are missed by at most "
         "%.0f); say %s=… if that is wrong",
         cfg.image,
@@ -357,7 +357,7 @@ def _run(
     precision = cfg.precision if cfg.precision != "auto" else auto_precision(device.type)
     if precision not in PRECISIONS:
         raise ConfigError(f"precision must be auto, {', '.join(PRECISIONS)}, got {precision!r}")
-    familiar = Familiar.beside(loaded.path)
+    familiar = loaded.familiar
     mend = mend_of(cfg, familiar)
     identity = (
         facts

@@ -19,14 +19,12 @@ from nerfdiff.exports.surface import Surface, SurfaceSettings
 from nerfdiff.exports.viewer import write_viewer
 from nerfdiff.exports.views import CameraPath, over, render_rgba, to_image
 from nerfdiff.fit.saved_field import FIELD, SavedField, load_field
+from nerfdiff.inputs import check_formats
 from nerfdiff.metrics.image import quantise
 from nerfdiff.results.pictures import orbit_video
 from nerfdiff.trajectories import Upright
 from nerfdiff.utils.config import plain
-from nerfdiff.utils.errors import ConfigError
 from nerfdiff.utils.files import atomic
-
-FORMATS = ("glb", "obj", "ply", "html", "mp4", "gif", "png")
 
 log = logging.getLogger(__name__)
 
@@ -138,12 +136,6 @@ class FieldExport:
             with atomic(folder / f"{number:02d}.png") as temporary:
                 to_image(frames[number * len(frames) // count]).save(temporary)
         return folder
-
-
-def check_formats(formats: Collection[str]) -> None:
-    """Raise ConfigError where a format is not one of `FORMATS`."""
-    if unknown := sorted(set(formats) - set(FORMATS)) or not formats:
-        raise ConfigError(f"format={unknown if formats else '[]'}: expected some of {', '.join(FORMATS)}")
 
 
 def export_fields(cfg: DictConfig, fields: Sequence[str]) -> list[Path]:

@@ -71,7 +71,7 @@ def _trimesh() -> Any:
     try:
         import trimesh
     except ImportError as error:
-        raise ConfigError("meshes and point clouds need trimesh: pip install 'nerfdiff[mesh]'") from error
+        raise ConfigError("meshes and point clouds need trimesh: pip install trimesh") from error
     return trimesh
 
 

@@ -16,6 +16,7 @@ from nerfdiff.field.decoder import Decoder
 from nerfdiff.field.triplane import Triplane
 from nerfdiff.fit.compact_planes import compact, restored
 from nerfdiff.fit.refined_field import RefinedField
+from nerfdiff.inputs import check_file
 from nerfdiff.render.renderer import Renderer
 from nerfdiff.trajectories import Upright
 from nerfdiff.utils.errors import DataError
@@ -77,6 +78,7 @@ def load_field(path: str | Path) -> SavedField:
     Raises:
         DataError: the file is missing, damaged, or something else.
     """
+    check_file("field", str(path), f"name a {FIELD}")
     try:
         with safe_open(path, framework="pt") as file:
             header = json.loads(file.metadata()["nerfdiff"])

@@ -66,7 +66,8 @@ class LiveViewer:
         self.panes, self.settings = panes, settings
         self._rendering = threading.Lock()  # one picture at a time, of whatever client
         self._clients: dict[int, _Client] = {}
-        self.server = viser.ViserServer(host, port, label="NerfDiff", verbose=False)
+        with contextlib.redirect_stdout(None):  # it would say the address twice, in a box
+            self.server = viser.ViserServer(host, port, label="NerfDiff", verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()
         self.server.scene.set_up_direction("+y")
@@ -301,5 +302,5 @@ def _viser():
     try:
         import viser
     except ImportError as error:
-        raise ConfigError("view.py needs viser: pip install 'nerfdiff[view]'") from error
+        raise ConfigError("view.py needs viser: pip install viser") from error
     return viser

@@ -76,6 +76,17 @@ def stored_size(path: Path) -> tuple[int, int]:
         return image.height, image.width
 
 
+def upright_size(path: Path) -> tuple[int, int]:
+    """(height, width) of the image turned as EXIF says, by the file's header.
+
+    Raises:
+        DataError: the file is missing or no image.
+    """
+    with _readable(path), Image.open(path) as image:
+        size = image.height, image.width
+        return size[::-1] if image.getexif().get(Base.Orientation) in (5, 6, 7, 8) else size
+
+
 def decode_levels(path: Path) -> Integer[np.ndarray, "height width"]:
     """Decode the one channel of an image as it is stored: labels, palette indices, or depths of 16 bits.
 

@@ -47,12 +47,6 @@ def test_models_scenes_and_masks_are_shown_in_one_line(model, scene):
     assert len(repr(replace(model.loaded, trained_on=()))) < 300
 
 
-def test_what_is_known_of_training_images_is_read_once(model, monkeypatch):
-    loaded, read = replace(model.loaded), []
-    monkeypatch.setattr("nerfdiff.stability.familiar.Familiar.load", lambda path: read.append(path))
-    assert loaded.familiar is None and loaded.familiar is None and len(read) == 1
-
-
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

@@ -39,6 +39,7 @@ from nerfdiff.exports.views import render_rgba, to_image
 from nerfdiff.fit.refined_field import RefinedField
 from nerfdiff.fit.saved_field import SavedField, load_field, save_field
 from nerfdiff.inputs import FORMATS, check_file, check_picture_settings
+from nerfdiff.stability.familiar import Familiar
 from nerfdiff.stability.judge import OK
 from nerfdiff.stability.mend import mend_of
 from nerfdiff.trajectories import Upright
@@ -149,7 +150,7 @@ class Model:
         except BackgroundError:
             mask = _cut_out(cfg, picture)
             scene = picture_scene(cfg, self.loaded, size, mask.where)
-        if (mend := mend_of(cfg, self.loaded.familiar)) is not None:
+        if (mend := mend_of(cfg, Familiar.beside(self.loaded.path))) is not None:
             scene = mend(scene)
         return cfg, scene.to(self.device), mask
 
@@ -167,7 +168,7 @@ class Model:
             raise ConfigError(f"strategy={strategy.name} leaves no scene: choose one that does, as ngd_current")
         if views.status != "ok":
             log.warning("the fit was %s: this is the last field before that", views.status)
-        judge, familiar = instantiate(cfg.judge), self.loaded.familiar
+        judge, familiar = instantiate(cfg.judge), Familiar.beside(self.loaded.path)
         with autocast(self.device, precision):
             verdict = judge.verdict(judge.signs(self.loaded.model, batch, views, familiar, cfg.seed), views.status)
         if verdict != OK:

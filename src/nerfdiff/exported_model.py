@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from safetensors.torch import load_file, save_file
 
 from nerfdiff.inputs import WEIGHTS
 from nerfdiff.model import NerfDiff
-from nerfdiff.stability.familiar import Familiar
 from nerfdiff.utils.errors import CheckpointError, ConfigError
 from nerfdiff.utils.files import atomic, write_text
 from nerfdiff.utils.hashes import sha256_file, sha256_values
@@ -46,15 +44,6 @@ class LoadedModel:
     image_size: list[int] | None
     stability: Mapping[str, float | int | None]
     trained_on: Sequence[Mapping[str, Any]] = field(default=(), repr=False)
-
-    @cached_property
-    def familiar(self) -> Familiar | None:
-        """What is known of the training images, read once; None where nothing lies beside the weights.
-
-        Raises:
-            DataError: it is damaged.
-        """
-        return Familiar.beside(self.path)
 
     def brief(self) -> str:
         """A few words on what the model is for."""

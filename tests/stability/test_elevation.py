@@ -1,12 +1,14 @@
 """Elevations are estimated from features, and how well is measured on images that the estimate has not seen."""
 
+import os
 from dataclasses import replace
 
 import pytest
 import torch
 
 from nerfdiff.stability.elevation import Elevation
-from nerfdiff.stability.familiar import Familiar
+from nerfdiff.stability.facts import FACTS
+from nerfdiff.stability.familiar import FAMILIAR, Familiar
 
 
 @pytest.fixture(scope="module")
@@ -47,3 +49,15 @@ def test_it_is_kept_with_what_is_familiar_and_images_of_unknown_elevation_are_le
     assert Elevation.of(found, torch.full_like(degrees, torch.nan)) is None
     replace(familiar, elevation=None).save(tmp_path / "familiar.safetensors")
     assert Familiar.load(tmp_path / "familiar.safetensors").elevation is None
+
+
+def test_a_file_beside_weights_is_read_again_only_when_it_changed(tmp_path):
+    weights, file = tmp_path / "model.safetensors", tmp_path / FAMILIAR
+    assert Familiar.beside(weights) is None
+    known = Familiar(torch.zeros(3), torch.eye(3)[:, :1], torch.ones(1), 1.0, 1.0, torch.zeros(len(FACTS), 3))
+    known.save(file)
+    first = Familiar.beside(weights)
+    assert first.usual == 1 and Familiar.beside(weights) is first
+    replace(known, usual=2.0).save(file)
+    os.utime(file, (1, 1))
+    assert Familiar.beside(weights).usual == 2

@@ -274,7 +274,7 @@ def framed_as_trained(cfg: DictConfig, loaded: LoadedModel) -> DictConfig:
     asked = [key for key, value in cfg.picture.items() if value == AUTO]
     if not asked:
         return cfg
-    familiar = loaded.familiar
+    familiar = Familiar.beside(loaded.path)
     known = familiar.framing() if familiar is not None else None
     if known is None:
         known = cfg.framing
@@ -316,7 +316,7 @@ def picture_scene(
 def _elevation(cfg: DictConfig, loaded: LoadedModel, scene: ViewBatch) -> float:
     """Estimate the degrees from which a picture looks down at its object."""
     key = "elevation" if "elevation" in cfg else "picture_views.source_elevation"
-    familiar = loaded.familiar
+    familiar = Familiar.beside(loaded.path)
     fit = None if familiar is None else familiar.elevation
     if fit is None or not fit.useful or familiar.framing() is None:
         log.warning(
@@ -357,7 +357,7 @@ def _run(
     precision = cfg.precision if cfg.precision != "auto" else auto_precision(device.type)
     if precision not in PRECISIONS:
         raise ConfigError(f"precision must be auto, {', '.join(PRECISIONS)}, got {precision!r}")
-    familiar = loaded.familiar
+    familiar = Familiar.beside(loaded.path)
     mend = mend_of(cfg, familiar)
     identity = (
         facts

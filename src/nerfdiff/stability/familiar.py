@@ -5,6 +5,7 @@ import logging
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -141,13 +142,16 @@ class Familiar:
 
     @staticmethod
     def beside(weights: Path) -> "Familiar | None":
-        """Read what lies beside a model's weights, if anything does.
+        """Read what lies beside a model's weights, if anything does; a file that stays the same is read once.
 
         Raises:
             DataError: it is damaged.
         """
         path = weights.parent / FAMILIAR
-        return Familiar.load(path) if path.is_file() else None
+        if not path.is_file():
+            return None
+        state = path.stat()
+        return _load(path, state.st_mtime_ns, state.st_size)
 
     @staticmethod
     def load(path: Path) -> "Familiar":
@@ -183,3 +187,8 @@ def measured(model, batches: Iterable[ViewBatch]) -> tuple[Float[Tensor, "images
     with torch.no_grad():
         found = [(features(model.encode(batch)).cpu(), facts(batch)) for batch in batches]
     return torch.cat([each for each, _ in found]), torch.cat([each for _, each in found])
+
+
+@lru_cache(maxsize=4)
+def _load(path: Path, modified: int, size: int) -> Familiar:
+    return Familiar.load(path)

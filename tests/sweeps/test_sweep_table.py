@@ -96,7 +96,7 @@ def test_jobs_are_those_of_hydras_sweeper(tmp_path):
         "budget.views": "range(5,8)",
         "name": "choice(p,q)",
     }
-    given = ["seed=3", "ckpt='a b'", "+new=1", "data.image_size=[1,2]"]
+    given = ["seed=3", "ckpt='a b'", "+new=1", "data.image_size=[1,2]", "out=runs/x_${name}/y"]
     words = [f"{key}={value}" for key, value in params.items()]
     (expected,) = BasicSweeper.split_arguments(OverridesParser.create().parse_overrides([*words, *given]), None)
     assert [list(job) for job in planned(sweep(tmp_path, params, *given))] == expected

@@ -7,7 +7,7 @@ from itertools import product
 from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from nerfdiff.results.inside import inside
 from nerfdiff.results.row import RESULTS, ResultRow, RowFile
@@ -89,9 +89,12 @@ def planned(sweep: DictConfig) -> list[tuple[str, ...]]:
     """
     if "proposals" in sweep.hydra.sweeper:
         return read_plan(Path(sweep.hydra.sweep.dir))
-    words = [f"{key}={value}" for key, value in (sweep.hydra.sweeper.params or {}).items()]
+    # as they were typed: an interpolation in them is each job's own
+    params = OmegaConf.to_container(sweep.hydra.sweeper.params or OmegaConf.create(), resolve=False)
+    typed = OmegaConf.to_container(sweep.hydra.overrides.task, resolve=False)
+    words = [f"{key}={value}" for key, value in params.items()]
     choices: dict[str, list[str]] = {}
-    for override in OverridesParser.create().parse_overrides([*words, *sweep.hydra.overrides.task]):
+    for override in OverridesParser.create().parse_overrides([*words, *typed]):
         key = override.get_key_element()
         sweeps = override.is_discrete_sweep()
         values = override.sweep_string_iterator() if sweeps else [override.get_value_element_as_str()]

@@ -78,22 +78,27 @@ def test_the_words_of_a_sweep_are_hydras_wherever_m_stands(words):
     assert found.multirun and len(found.overrides) == sum("=" in word and word[0] != "-" for word in words) + 1
 
 
-def test_a_command_says_so_before_it_imports_anything_slow():
-    code = """
+@pytest.mark.parametrize(
+    ("command", "word", "said"),
+    [("distill", "ckpt=nowhere", "error: ckpt=nowhere is neither"), ("picture", "text.png", "error: text.png: ")],
+)
+def test_a_command_says_so_before_it_imports_anything_slow(command, word, said, tmp_path):
+    (tmp_path / "text.png").touch()
+    before = sorted(tmp_path.iterdir())
+    code = f"""
 import sys
-from nerfdiff.commands.distill import main
-sys.argv = ["distill.py", "ckpt=nowhere"]
+from nerfdiff.commands.{command} import main
+sys.argv = ["{command}.py", "{word}"]
 try:
     main()
 finally:
-    assert not {"torch", "lightning", "pandas"} & set(sys.modules)
+    assert not {{"torch", "lightning", "pandas"}} & set(sys.modules)
 """
-    before = sorted(Path().iterdir())
     environment = {"PYTHONPATH": str(ASSETS.parent / "src")}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
-    assert done.returncode == 1
-    assert done.stderr.startswith("error: ckpt=nowhere is neither") and done.stderr.count("\n") == 1
-    assert sorted(Path().iterdir()) == before  # no run, and no row of a failure
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, env=environment)
+    assert done.returncode == 1 and done.stdout == ""
+    assert done.stderr.startswith(said) and done.stderr.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before  # no run, and no row of a failure
 
 
 def test_each_command_looks_for_what_it_reads(monkeypatch):

@@ -46,7 +46,7 @@ class LoadedModel:
     trained_on: Sequence[Mapping[str, Any]] = field(default=(), repr=False)
 
     def brief(self) -> str:
-        """A few words on what the model is for."""
+        """Say in a few words what the model was trained on."""
         size = f"{self.image_size[0]}x{self.image_size[1]} pixels, " if self.image_size else ""
         last = self.trained_on[-1] if self.trained_on else {"about": "what was not recorded"}
         return f"{size}trained on {last['about'] or last['dataset']}"

@@ -123,6 +123,15 @@ def check_box(box: Sequence[float], height: int, width: int) -> None:
         )
 
 
+def check_mask_size(mask: str, size: tuple[int, int], picture: str, expected: tuple[int, int]) -> None:
+    """Raise DataError where a mask's (height, width) is not its picture's."""
+    if size != expected:
+        (h, w), (rows, columns) = size, expected
+        raise DataError(
+            f"{mask}: a mask of {h}x{w} for {picture} of {rows}x{columns} (height x width); expected one size"
+        )
+
+
 def check_output(cfg: DictConfig) -> None:
     """Refuse a composed config, Hydra's node included, whose run folder cannot be written.
 

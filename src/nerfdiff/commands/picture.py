@@ -5,8 +5,8 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from nerfdiff.cli import command_words, entry_point
-from nerfdiff.inputs import check_box, check_formats, check_picture_settings
-from nerfdiff.utils.errors import ConfigError, DataError
+from nerfdiff.inputs import check_box, check_formats, check_mask_size, check_picture_settings
+from nerfdiff.utils.errors import ConfigError
 
 
 def check(cfg: DictConfig) -> None:
@@ -29,11 +29,8 @@ def check(cfg: DictConfig) -> None:
     sizes = [upright_size(Path(image)) for image in cfg.images]
     if cfg.cutout.box is not None:
         check_box(cfg.cutout.box, *sizes[0])
-    if cfg.mask is not None and (size := upright_size(Path(cfg.mask))) != sizes[0]:
-        (h, w), (rows, columns) = size, sizes[0]
-        raise DataError(
-            f"{cfg.mask}: a mask of {h}x{w} for {cfg.images[0]} of {rows}x{columns} (height x width); expected one size"
-        )
+    if cfg.mask is not None:
+        check_mask_size(cfg.mask, upright_size(Path(cfg.mask)), cfg.images[0], sizes[0])
 
 
 @entry_point("picture", "ckpt", "images", "mask")

@@ -19,6 +19,7 @@ from nerfdiff.data.batch import Sample, ViewBatch
 from nerfdiff.data.formats.images import decode_with_alpha
 from nerfdiff.data.readers.masks import read_mask
 from nerfdiff.data.scene import Scene
+from nerfdiff.inputs import check_mask_size
 from nerfdiff.utils.errors import BackgroundError, ConfigError, DataError
 
 log = logging.getLogger(__name__)
@@ -148,11 +149,7 @@ class Picture:
     def _masked(self, path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
         """Read where the mask of `path`, of `size`, has the object."""
         where = _upright(read_mask(Path(self.mask)), Path(self.mask))
-        if where.shape != size:
-            (h, w), (rows, columns) = where.shape, size
-            raise DataError(
-                f"{self.mask}: a mask of {h}x{w} for {path} of {rows}x{columns} (height x width); expected one size"
-            )
+        check_mask_size(str(self.mask), where.shape, str(path), size)
         covered = _of_border(where)
         if where.all() or not where.any() or 1 - covered < self.open_border:
             found = f"white on {covered:.0%} of its border" if where.any() else "all black"

@@ -87,11 +87,11 @@ class FieldExport:
 
     @cached_property
     def clear_frames(self) -> Float[Tensor, "frames 4 height _width"]:
-        """The same without what only repeats the field's background."""
+        """The same, `cleared`."""
         return self.cleared(self.frames)
 
     def cleared(self, rgba: Float[Tensor, "views 4 height width"]) -> Float[Tensor, "views 4 height width"]:
-        """Pictures with transparency, without what only repeats the field's background."""
+        """Make transparent what only repeats the field's background, where that can be told."""
         return rgba if self.backdrop is None else self.backdrop.cleared(rgba)
 
     def _filmed(self) -> Float[Tensor, "frames 3 height _width"]:

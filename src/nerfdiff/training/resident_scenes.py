@@ -1,4 +1,4 @@
-"""What training from memory holds on the device: all images, the draws of every step, a frozen field's renderings."""
+"""Keep on the device what training from memory needs: all images, each step's draws, a frozen field's renderings."""
 
 import logging
 import math
